@@ -1,0 +1,119 @@
+"""Where on the body each detector's keypoints lie.
+
+A landmark is a point fixed on a bone; a keypoint is its image. Offsets are fractions of stature in
+the bone's frame (x left, y up, z forward in the rest pose), so one table serves everyone. Limb
+keypoints sit on the joint centres; those of the head, trunk and feet follow the adult head and foot
+breadths and heights of Winter, "Biomechanics and Motor Control of Human Movement", fig. 4.1, and
+NASA-STD-3000 vol. 1, sec. 3 (tragion, eye and nose against the top of the neck). They are starting
+values without any detector's bias; eq. 17-18 of the paper calibrate them to a detector.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from fusecap.body.shape import BodyShape
+from fusecap.body.skeleton import Skeleton
+from fusecap.errors import InputError, nearest
+
+_TRUNK_AND_HEAD = {
+    "mid_hip": ("hips", (0.0, -0.020, 0.0)),
+    "chest": ("spine1", (0.0, 0.010, 0.0)),
+    "neck": ("spine3", (0.0, 0.040, 0.0)),
+    "upper_neck": ("neck", (0.0, 0.030, 0.0)),
+    "head_top": ("head", (0.0, 0.110, -0.010)),
+    "nose": ("head", (0.0, 0.022, 0.060)),
+}
+_SIDED = {
+    "eye": ("head", (0.018, 0.042, 0.047)),
+    "ear": ("head", (0.043, 0.033, 0.0)),
+    "shoulder": ("{side}_upper_arm", (0.0, 0.0, 0.0)),
+    "elbow": ("{side}_forearm", (0.0, 0.0, 0.0)),
+    "wrist": ("{side}_hand", (0.0, 0.0, 0.0)),
+    "hip": ("{side}_thigh", (0.0, 0.0, 0.0)),
+    "knee": ("{side}_shank", (0.0, 0.0, 0.0)),
+    "ankle": ("{side}_foot", (0.0, 0.0, 0.0)),
+    "big_toe": ("{side}_toes", (-0.014, 0.0, 0.035)),
+    "small_toe": ("{side}_toes", (0.026, 0.0, 0.010)),
+    "heel": ("{side}_foot", (0.0, -0.028, -0.032)),
+}
+
+
+def _all_landmarks() -> dict[str, tuple[str, tuple[float, float, float]]]:
+    table = dict(_TRUNK_AND_HEAD)
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        for name, (bone, (x, y, z)) in _SIDED.items():
+            table[f"{side}_{name}"] = (bone.format(side=side), (sign * x, y, z))
+    return table
+
+
+LANDMARKS = _all_landmarks()
+"""Landmark name to (bone, offset in the bone's frame as a fraction of stature)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LandmarkSet:
+    """The landmarks of one detector, in the order of its keypoints."""
+
+    name: str
+    landmark_names: tuple[str, ...]
+
+    def index(self, name: str) -> int | None:
+        """Position of a landmark, or None where this detector does not have it."""
+        return self.landmark_names.index(name) if name in self.landmark_names else None
+
+    @cached_property
+    def mirror(self) -> Int[np.ndarray, " k"]:
+        """For each landmark the index of the same one on the other side of the body."""
+        swap = {"left": "right", "right": "left"}
+        mirrored = []
+        for name in self.landmark_names:
+            side, _, rest = name.partition("_")
+            mirrored.append(f"{swap[side]}_{rest}" if side in swap else name)
+        return np.array([self.landmark_names.index(name) for name in mirrored], dtype=np.int64)
+
+    def bones(self, skeleton: Skeleton) -> Int[np.ndarray, " k"]:
+        """The bone that carries each landmark."""
+        return np.array(
+            [skeleton.bone(LANDMARKS[name][0]) for name in self.landmark_names], dtype=np.int64
+        )
+
+    def offsets_m(self, shape: BodyShape) -> Float[np.ndarray, "k 3"]:
+        """Default offsets t_pb of eq. 5, in the bones' frames [m], for a body of this stature."""
+        return np.array([LANDMARKS[name][1] for name in self.landmark_names]) * shape.height_m
+
+
+_COCO = (
+    "nose left_eye right_eye left_ear right_ear left_shoulder right_shoulder left_elbow "
+    "right_elbow left_wrist right_wrist left_hip right_hip left_knee right_knee left_ankle "
+    "right_ankle"
+)
+_RIGHT_THEN_LEFT_ARM = "right_shoulder right_elbow right_wrist left_shoulder left_elbow left_wrist"
+_ORDERS = {
+    "body25": f"nose neck {_RIGHT_THEN_LEFT_ARM} mid_hip right_hip right_knee right_ankle "
+    "left_hip left_knee left_ankle right_eye left_eye right_ear left_ear left_big_toe "
+    "left_small_toe left_heel right_big_toe right_small_toe right_heel",
+    "body25b": f"{_COCO} upper_neck head_top left_big_toe left_small_toe left_heel "
+    "right_big_toe right_small_toe right_heel",
+    "halpe26": f"{_COCO} head_top neck mid_hip left_big_toe right_big_toe left_small_toe "
+    "right_small_toe left_heel right_heel",
+    "coco17": _COCO,
+    "mpi15": f"head_top neck {_RIGHT_THEN_LEFT_ARM} right_hip right_knee right_ankle left_hip "
+    "left_knee left_ankle chest",
+}
+
+LANDMARK_SETS = {
+    name: LandmarkSet(name=name, landmark_names=tuple(order.split()))
+    for name, order in _ORDERS.items()
+}
+
+
+def landmark_set_named(name: str) -> LandmarkSet:
+    """The landmark set called `name`; raises `InputError` naming the known ones."""
+    if name not in LANDMARK_SETS:
+        raise InputError(f"no landmark set '{name}'{nearest(name, LANDMARK_SETS)}")
+    return LANDMARK_SETS[name]

@@ -1,0 +1,88 @@
+"""What crosses a stage.
+
+    sources ──Detections, ImuReading──▶ associate ──Observation──▶ solve ──Estimate──▶ sinks
+
+Arrays are float64, shapes are types, missing values are NaN with confidence 0. Times are int
+nanoseconds on one clock.
+"""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from fusecap.body.shape import BodyShape
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImuSample:
+    """One reading of one sensor, as it was measured."""
+
+    timestamp_ns: int
+    orientation_wxyz: Float[np.ndarray, "4"]
+    """imu_world_from_imu."""
+    accel_m_s2: Float[np.ndarray, "3"]
+    """Specific force in the imu frame (at rest +9.8 along up); NaN where not measured."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImuReading:
+    """What the I sensors of one subject say about its bones at one instant, in the world."""
+
+    bone_rotation_in_world: Float[np.ndarray, "i 3 3"]
+    """Measured bone orientation [1, eq. 8]; NaN where no sample is near."""
+    accel_in_world_m_s2: Float[np.ndarray, "i 3"]
+    """Acceleration without gravity [1, eq. 12]; NaN where not measured."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Detections:
+    """Everyone the detector found in every camera at one instant."""
+
+    timestamp_ns: int
+    people: tuple[Float[np.ndarray, "n k 3"], ...]
+    """Per camera the n people's keypoints: x [px], y [px], confidence 0-1 (0 = missing)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Observation:
+    """The measurements that were assigned to one track at one instant."""
+
+    timestamp_ns: int
+    keypoints: Float[np.ndarray, "c k 3"]
+    """Per camera: x [px], y [px], confidence (0 = missing)."""
+    imu: ImuReading | None = None
+
+
+class Status(enum.Enum):
+    """How a solve ended."""
+
+    CONVERGED = 0
+    ITERATION_LIMIT = 1
+    DIVERGED = 2
+    """No finite improvement could be found; the pose is the one it started from."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Estimate:
+    """One subject's pose at one instant."""
+
+    track_id: int
+    name: str
+    timestamp_ns: int
+    theta: Float[np.ndarray, " p"]
+    bone_position_in_world_m: Float[np.ndarray, "b 3"]
+    bone_rotation_in_world: Float[np.ndarray, "b 3 3"]
+    bone_quality: Float[np.ndarray, " b"]
+    """0-1: the share of a bone's orientation uncertainty under the prior that data removed."""
+    shape: BodyShape
+    status: Status
+    iterations: int
+    cost: float
+    solve_s: float
+    """Wall time of the solve alone."""
+    views: Bool[np.ndarray, " c"]
+    """Which cameras contributed."""
