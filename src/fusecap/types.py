@@ -12,7 +12,7 @@ import enum
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from fusecap.body.shape import BodyShape
 
@@ -86,3 +86,24 @@ class Estimate:
     """Wall time of the solve alone."""
     views: Bool[np.ndarray, " c"]
     """Which cameras contributed."""
+
+
+class TrackState(enum.Enum):
+    """A track's life: tentative until seen often enough, confirmed, coasting while unseen."""
+
+    TENTATIVE = "tentative"
+    CONFIRMED = "confirmed"
+    COASTING = "coasting"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrackUpdate:
+    """What association decided about one track at one instant."""
+
+    track_id: int
+    name: str
+    state: TrackState
+    person: Int[np.ndarray, " c"]
+    """Per camera the index into `Detections.people`, or -1 where the track is not seen."""
+    landmarks_in_world_m: Float[np.ndarray, "k 3"]
+    """Triangulated from the assigned keypoints; NaN where fewer than two views agree."""
