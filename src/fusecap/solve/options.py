@@ -1,0 +1,69 @@
+"""What tunes a solve; every default in one place."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+
+from fusecap.errors import InputError, nearest
+
+
+@dataclass(frozen=True, kw_only=True)
+class Weights:
+    """λ of each term, the paper's values [1, sec. 3.2.6]; 0 switches a term off."""
+
+    position: float = 1e-3
+    """Per px² of a 1920-pixel-wide image, times the keypoint's confidence."""
+    orientation: float = 1.0
+    """Per sin²(φ/2)."""
+    acceleration: float = 1e-3
+    """Per (m/s²)²."""
+    projection: float = 0.7
+    """Per rad² outside the PCA subspace."""
+    deviation: float = 0.06
+    """Per squared standard deviation within it."""
+    floor: float = 10.0
+    """Per m² below the floor."""
+
+    def __post_init__(self) -> None:
+        for term in fields(self):
+            value = getattr(self, term.name)
+            if not (math.isfinite(value) and value >= 0):
+                raise InputError(f"weight '{term.name}' is {value}; expected a number >= 0")
+
+    @classmethod
+    def named(cls, **weights: float) -> Weights:
+        """Defaults with some terms set by name; an unknown name is an `InputError`."""
+        known = [term.name for term in fields(cls)]
+        for name in weights:
+            if name not in known:
+                raise InputError(f"no cost term '{name}'{nearest(name, known)}")
+        return cls(**weights)
+
+    @property
+    def array(self) -> np.ndarray:
+        """In the order of the kernels."""
+        return np.array([getattr(self, term.name) for term in fields(self)], dtype=np.float64)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolverOptions:
+    """Weights, stopping rule and floor of the pose solver."""
+
+    weights: Weights = field(default_factory=Weights)
+    max_iterations: int = 30
+    function_tolerance: float = 1e-4
+    """Stop when a step lowers the cost by less than this share of it."""
+    initial_damping: float = 1e-2
+    floor_radius_m: float = 0.05
+    """Distance kept between the floor and the ankle and toe joints [1, eq. 16]."""
+    quality: bool = True
+    """Compute the per-bone quality after each solve (about a quarter of a solve's time)."""
+
+    def __post_init__(self) -> None:
+        if self.max_iterations < 1:
+            raise InputError(f"max_iterations is {self.max_iterations}; expected at least 1")
+        if not 0 < self.function_tolerance < 1:
+            raise InputError(f"function_tolerance is {self.function_tolerance}; expected 0-1")

@@ -1,0 +1,216 @@
+"""The cost of one body at one instant, minimised: the front of `fusecap.kernels.solve`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from fusecap.body.landmarks import LandmarkSet
+from fusecap.body.prior import PosePrior
+from fusecap.body.shape import BodyShape
+from fusecap.errors import InputError
+from fusecap.geometry.camera import Rig
+from fusecap.kernels import cholesky
+from fusecap.kernels import solve as kernels
+from fusecap.solve.options import SolverOptions
+from fusecap.types import Status
+
+_FLOOR_BONES = ("left_foot", "left_toes", "right_foot", "right_toes")
+_ROOT_PRIOR_VARIANCE = np.pi**2
+"""Per axis [rad²], of a root that could face anywhere: what its quality is measured against."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImuSites:
+    """Where a subject's I sensors sit."""
+
+    bone: tuple[int, ...]
+    position_m: Float[np.ndarray, "i 3"]
+    """t_ib in the bones' frames; used by the acceleration term only."""
+
+    @classmethod
+    def none(cls) -> ImuSites:
+        """A subject without sensors."""
+        return cls(bone=(), position_m=np.zeros((0, 3)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measurements:
+    """The data of one solve, in the world; NaN or zero confidence is missing."""
+
+    keypoints: Float[np.ndarray, "c k 3"]
+    imu_rotation: Float[np.ndarray, "i 3 3"]
+    """Measured bone orientations [1, eq. 8]."""
+    imu_accel: Float[np.ndarray, "i 3"]
+    """At the previous instant, without gravity [1, eq. 12]."""
+    imu_history: Float[np.ndarray, "2 i 3"]
+    """Solved sensor sites one and two instants ago."""
+    dt_s: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Solution:
+    """Where a solve ended."""
+
+    theta: Float[np.ndarray, " p"]
+    position_in_world_m: Float[np.ndarray, "b 3"]
+    rotation_in_world: Float[np.ndarray, "b 3 3"]
+    bone_quality: Float[np.ndarray, " b"]
+    status: Status
+    iterations: int
+    cost: float
+
+
+class PoseSolver:
+    """Minimises eq. 2 for one subject.
+
+    It owns every array the kernel needs, so a solve allocates nothing but its result. One thread
+    per solver at a time; several solvers run in parallel.
+    """
+
+    def __init__(
+        self,
+        *,
+        shape: BodyShape,
+        rig: Rig,
+        landmarks: LandmarkSet,
+        prior: PosePrior,
+        sites: ImuSites | None = None,
+        options: SolverOptions | None = None,
+    ) -> None:
+        skeleton = shape.skeleton
+        if prior.mean.size != 3 * skeleton.bone_count - 3:
+            raise InputError(
+                f"the prior '{prior.skeleton_name}' has {prior.mean.size} numbers; "
+                f"'{skeleton.name}' needs {3 * skeleton.bone_count - 3}"
+            )
+        self.skeleton = skeleton
+        self.landmarks = landmarks
+        self.options = options or SolverOptions()
+        self.sites = sites or ImuSites.none()
+        self._rig = rig.packed
+        self._landmark_bone = landmarks.bones(skeleton)
+        self._imu_bone = np.array(self.sites.bone, dtype=np.int64)
+        self._imu_weight = np.zeros(len(self.sites.bone))
+        self._prior = (prior.mean, prior.projector, prior.precision)
+        self._floor_bone = np.array([skeleton.bone(name) for name in _FLOOR_BONES], dtype=np.int64)
+        self._weights = self.options.weights.array
+        self._prior_variance = self._variance_under_prior(prior)
+        n, b = skeleton.pose_size, skeleton.bone_count
+        self._position = np.zeros((b, 3))
+        self._rotation = np.zeros((b, 3, 3))
+        self._posed = (self._position, self._rotation, np.zeros((b, 3, 3)))
+        self._scratch = (
+            np.zeros((3, 3)),
+            np.zeros((3, 3)),
+            np.zeros(3),
+            np.zeros((b, 6, 6)),
+            np.zeros((b, 6)),
+            np.zeros((b, 6, 3)),
+            np.zeros((6, 3)),
+        )
+        self._hessian = np.zeros((2, n, n))
+        self._gradient = np.zeros((2, n))
+        self._lower = np.zeros((n, n))
+        self._inverse = np.zeros((n, n))
+        self._vectors = (np.zeros(n), np.zeros(n), np.zeros(n))
+        self.set_shape(shape)
+
+    def set_shape(self, shape: BodyShape, landmark_offsets_m: np.ndarray | None = None) -> None:
+        """Change bone lengths, and landmark offsets (by default those of the stature)."""
+        self.shape = shape
+        self._offsets = np.ascontiguousarray(shape.offsets_m, dtype=np.float64)
+        if landmark_offsets_m is None:
+            landmark_offsets_m = self.landmarks.offsets_m(shape)
+        self.landmark_offsets_m = np.ascontiguousarray(landmark_offsets_m, dtype=np.float64)
+
+    def solve(self, theta: Float[np.ndarray, " p"], data: Measurements) -> Solution:
+        """Minimise from `theta`; always returns finite numbers when `theta` is finite."""
+        options = self.options
+        result = np.array(theta, dtype=np.float64)
+        status, iterations, cost = kernels.solve(
+            result,
+            options.max_iterations,
+            options.function_tolerance,
+            options.initial_damping,
+            *self._inputs(data),
+            *self._posed,
+            *self._scratch,
+            self._hessian,
+            self._gradient,
+            self._lower,
+            *self._vectors,
+        )
+        return Solution(
+            theta=result,
+            position_in_world_m=self._position.copy(),
+            rotation_in_world=self._rotation.copy(),
+            bone_quality=self._quality() if options.quality else np.ones(len(self._position)),
+            status=Status(status),
+            iterations=iterations,
+            cost=cost,
+        )
+
+    def evaluate(
+        self, theta: Float[np.ndarray, " p"], data: Measurements
+    ) -> tuple[float, Float[np.ndarray, " p"], Float[np.ndarray, "p p"]]:
+        """Cost, gradient and Gauss-Newton matrix at `theta`, for checks and for other solvers."""
+        cost = kernels.evaluate(
+            np.ascontiguousarray(theta, dtype=np.float64),
+            *self._inputs(data),
+            *self._posed,
+            *self._scratch,
+            self._hessian[0],
+            self._gradient[0],
+        )
+        lower = np.tril(self._hessian[0])
+        return cost, self._gradient[0].copy(), lower + np.tril(lower, -1).T
+
+    def _inputs(self, data: Measurements) -> Sequence[object]:
+        expected = (len(self._rig), len(self._landmark_bone), 3)
+        if data.keypoints.shape != expected:
+            raise InputError(f"keypoints are {data.keypoints.shape}; expected {expected}")
+        self._imu_weight[:] = np.isfinite(data.imu_rotation[:, 0, 0])
+        return (
+            self.skeleton.parent_array,
+            self._offsets,
+            self._landmark_bone,
+            self.landmark_offsets_m,
+            self._rig,
+            data.keypoints,
+            self._imu_bone,
+            data.imu_rotation,
+            self._imu_weight,
+            self.sites.position_m,
+            data.imu_accel,
+            data.imu_history,
+            data.dt_s,
+            *self._prior,
+            self._floor_bone,
+            self.options.floor_radius_m,
+            self._weights,
+        )
+
+    def _quality(self) -> np.ndarray:
+        """1 - posterior / prior variance per bone, from the Gauss-Newton matrix at the solution."""
+        size = len(self._gradient[0])
+        ridge = np.full(size, 1e-9)
+        ridge[3:6] = 1 / _ROOT_PRIOR_VARIANCE
+        if not cholesky.factor(self._hessian[0], ridge, self._lower):
+            return np.zeros(self.skeleton.bone_count)
+        posterior = self._vectors[0]
+        cholesky.inverse_diagonal(self._lower, self._inverse, posterior)
+        per_bone = posterior[3:].reshape(-1, 3).sum(axis=1)
+        return np.clip(1 - per_bone / self._prior_variance, 0.0, 1.0)
+
+    def _variance_under_prior(self, prior: PosePrior) -> np.ndarray:
+        """Trace of each bone's covariance when nothing is measured, from the PCA terms."""
+        weights = self.options.weights
+        projection, deviation = max(weights.projection, 1e-3), max(weights.deviation, 1e-3)
+        outside = np.diag(prior.projector) / projection
+        inside = np.einsum("ij,j,ij->i", prior.basis, prior.sigma**2, prior.basis) / deviation
+        root = [3 * _ROOT_PRIOR_VARIANCE]
+        return np.concatenate([root, (outside + inside).reshape(-1, 3).sum(axis=1)])

@@ -1,0 +1,58 @@
+"""Motions and takes for tests that need no recording."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fusecap.body.shape import BodyShape
+from fusecap.body.skeleton import PAPER21, Skeleton
+from fusecap.sinks.take import Take, take_from_theta
+
+
+def walk(
+    shape: BodyShape, frames: int, *, rate_hz: float = 60.0, phase_rad: float = 0.0
+) -> np.ndarray:
+    """A walk to and fro along z, arms down, theta (T, P)."""
+    skeleton = shape.skeleton
+    time_s = np.arange(frames) / rate_hz
+    stride_rad = 2 * np.pi * 0.9 * time_s + phase_rad
+    theta = np.zeros((frames, skeleton.pose_size))
+    theta[:, 1] = shape.standing_root_height_m
+    theta[:, 2] = 1.2 * np.sin(0.5 * time_s)
+
+    def column(bone: str, axis: int) -> int:
+        return 3 + 3 * skeleton.bone(bone) + axis
+
+    for side, sign in (("left", 1), ("right", -1)):
+        theta[:, column(f"{side}_upper_arm", 2)] = -sign * 1.2
+        theta[:, column(f"{side}_thigh", 0)] = -sign * 0.5 * np.sin(stride_rad)
+        theta[:, column(f"{side}_shank", 0)] = 0.4 * (1 + np.sin(sign * stride_rad))
+    return theta
+
+
+def any_poses(rng: np.random.Generator, skeleton: Skeleton, frames: int) -> np.ndarray:
+    """Every joint anywhere, up to half a turn; theta (T, P)."""
+    vector = rng.standard_normal((frames, skeleton.bone_count, 3))
+    angle = rng.uniform(0, np.pi, (frames, skeleton.bone_count, 1))
+    vector *= angle / np.linalg.norm(vector, axis=-1, keepdims=True)
+    root_m = rng.uniform(-3, 3, (frames, 3))
+    return np.concatenate([root_m, vector.reshape(frames, -1)], axis=1)
+
+
+def take_of(
+    theta: np.ndarray, shapes: list[BodyShape], *, names: tuple[str, ...], rate_hz: float = 60.0
+) -> Take:
+    """A take of motions (S, T, P), tracked throughout."""
+    frames = theta.shape[1]
+    return take_from_theta(
+        theta,
+        shapes,
+        timestamps_ns=np.round(np.arange(frames) * (1e9 / rate_hz)).astype(np.int64),
+        rate_hz=rate_hz,
+        subject_names=names,
+        skeleton=shapes[0].skeleton,
+    )
+
+
+def person(height_m: float = 1.75, skeleton: Skeleton = PAPER21) -> BodyShape:
+    return BodyShape.from_height(skeleton, height_m)

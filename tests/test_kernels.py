@@ -1,0 +1,126 @@
+"""Rotations, kinematics, projection and linear algebra of the kernels against SciPy and NumPy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.spatial.transform import Rotation
+
+from fusecap.body.pose import forward_kinematics
+from fusecap.body.shape import BodyShape
+from fusecap.body.skeleton import EXTENDED23, PAPER21
+from fusecap.kernels import cholesky, kinematics, lie, projection
+from scenes import random_pose, ring
+
+vectors = arrays(np.float64, 3, elements=st.floats(-6.0, 6.0))
+scales = st.sampled_from([1.0, 1e-3, 1e-5, 1e-9, 0.0])
+
+
+def exp(vector):
+    out = np.full((3, 3), np.inf)
+    lie.exp_so3(*vector, out)
+    return out
+
+
+@given(vectors, scales)
+def test_exp_agrees_with_scipy_also_near_zero(vector, scale):
+    vector = vector * scale
+    expected = Rotation.from_rotvec(vector).as_matrix()
+    np.testing.assert_allclose(exp(vector), expected, atol=2e-12)
+
+
+@given(vectors, scales)
+def test_left_jacobian_is_the_derivative_of_exp(vector, scale):
+    vector = vector * scale
+    jacobian = np.full((3, 3), np.inf)
+    lie.left_jacobian_so3(*vector, jacobian)
+    step = 1e-6
+    for axis in range(3):
+        delta = np.eye(3)[axis] * step
+        difference = exp(vector + delta) @ exp(vector - delta).T
+        numeric = Rotation.from_matrix(difference).as_rotvec() / (2 * step)
+        np.testing.assert_allclose(jacobian[:, axis], numeric, atol=1e-7)
+
+
+@given(vectors)
+def test_wrapping_keeps_the_rotation_and_ends_at_most_at_pi(vector):
+    theta = np.concatenate([[1.0, 2.0, 3.0], vector * 3])
+    wrapped = theta.copy()
+    lie.wrap_pose(wrapped)
+    assert np.linalg.norm(wrapped[3:]) <= np.pi + 1e-9
+    np.testing.assert_allclose(exp(wrapped[3:]), exp(theta[3:]), atol=1e-11)
+    np.testing.assert_array_equal(wrapped[:3], theta[:3])
+
+
+@pytest.mark.parametrize("skeleton", [PAPER21, EXTENDED23])
+def test_kernel_kinematics_agree_with_the_vectorised_ones(skeleton, rng):
+    shape = BodyShape.from_height(skeleton, 1.8)
+    theta = random_pose(rng, 1.0, skeleton)
+    b = skeleton.bone_count
+    position, rotation = np.full((b, 3), np.inf), np.full((b, 3, 3), np.inf)
+    kinematics.forward(
+        theta,
+        skeleton.parent_array,
+        shape.offsets_m,
+        position,
+        rotation,
+        np.full((b, 3, 3), np.inf),
+        np.zeros((3, 3)),
+    )
+    expected_position, expected_rotation = forward_kinematics(shape, theta[None])
+    np.testing.assert_allclose(position, expected_position[0], atol=1e-12)
+    np.testing.assert_allclose(rotation, expected_rotation[0], atol=1e-12)
+
+
+@pytest.mark.parametrize("distortion", [(0, 0, 0, 0, 0), (-0.2, 0.05, 1e-3, -2e-3, 0.01)])
+def test_projection_agrees_with_the_camera_and_its_jacobian_with_differences(distortion, rng):
+    camera = ring(1, distortion=distortion).cameras[0]
+    for point in rng.normal(scale=0.8, size=(20, 3)) + [0, 1, 0]:
+        values = np.array(projection.project_with_jacobian(camera.packed, *point))
+        assert values[0] == 1.0
+        np.testing.assert_allclose(values[1:3], camera.project(point[None])[0], atol=1e-9)
+        for axis in range(3):
+            delta = np.eye(3)[axis] * 1e-6
+            plus = camera.project((point + delta)[None])[0]
+            minus = camera.project((point - delta)[None])[0]
+            numeric = (plus - minus) / 2e-6
+            np.testing.assert_allclose(values[[3 + axis, 6 + axis]], numeric, rtol=1e-5, atol=1e-4)
+
+
+def test_a_point_behind_the_camera_is_not_imaged():
+    camera = ring(1).cameras[0]
+    behind = camera.position_in_world - camera.rotation[2]
+    assert projection.project_with_jacobian(camera.packed, *behind) == (0.0,) * 9
+    assert np.isnan(camera.project(behind[None])).all()
+
+
+def test_a_point_beyond_the_range_of_the_distortion_is_not_imaged():
+    camera = ring(1, distortion=(-0.3, 0, 0, 0, 0)).cameras[0]
+    assert camera.max_radius_squared == pytest.approx(1 / 0.9)
+    sideways = camera.position_in_world + camera.rotation[2] + 1.2 * camera.rotation[0]
+    assert projection.project_with_jacobian(camera.packed, *sideways)[0] == 0.0
+
+
+@pytest.mark.parametrize("size", [1, 5, 66])
+def test_cholesky_solves_and_gives_the_diagonal_of_the_inverse(size, rng):
+    root = rng.normal(size=(size, size))
+    matrix = root @ root.T + np.eye(size)
+    lower = np.full((size, size), np.inf)
+    assert cholesky.factor(matrix, np.full(size, 0.5), lower)
+    right = rng.normal(size=size)
+    solution = np.full(size, np.inf)
+    cholesky.solve_factored(lower, right, solution)
+    damped = matrix + 0.5 * np.eye(size)
+    np.testing.assert_allclose(damped @ solution, right, atol=1e-9)
+    diagonal = np.full(size, np.inf)
+    cholesky.inverse_diagonal(lower, np.full((size, size), np.inf), diagonal)
+    np.testing.assert_allclose(diagonal, np.diag(np.linalg.inv(damped)), rtol=1e-9)
+
+
+def test_cholesky_refuses_what_is_not_positive_definite():
+    lower = np.zeros((2, 2))
+    assert not cholesky.factor(np.diag([1.0, -1.0]), np.zeros(2), lower)
+    assert not cholesky.factor(np.full((2, 2), np.nan), np.zeros(2), lower)
