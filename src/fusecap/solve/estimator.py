@@ -1,0 +1,260 @@
+"""One subject's motion over time: initialise, warm-start, predict, recover.
+
+    update(observation) -> Estimate        one solve per instant, warm-started by the previous pose
+
+Time is an argument; an `Estimator` holds no clock or thread, so a recording replays bit for bit and
+several subjects can be updated on threads.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from fusecap.body.landmarks import LandmarkSet
+from fusecap.body.pose import landmarks_in_world
+from fusecap.body.prior import PosePrior
+from fusecap.body.shape import BodyShape
+from fusecap.body.skeleton import PAPER21, Skeleton
+from fusecap.geometry.camera import Rig
+from fusecap.solve.body_measure import BodyMeasure
+from fusecap.solve.initialize import (
+    neutral_pose,
+    pose_from_imus,
+    pose_from_landmarks,
+    poses_from_one_view,
+)
+from fusecap.solve.options import SolverOptions
+from fusecap.solve.pose_solver import ImuSites, Measurements, PoseSolver, Solution
+from fusecap.types import Estimate, Observation
+
+_DEFAULT_HEIGHT_M = 1.72
+"""Of a person nobody has measured yet."""
+_POOR_COST_PER_KEYPOINT = 0.25
+"""½ log(1 + s) per keypoint above which another start is tried: half the keypoints are about 30 px
+off (s = 1 at λ = 1e-3 and full confidence) in a 1920-pixel-wide image."""
+_RESTART_INTERVAL_S = 0.25
+_MAX_PREDICTION_S = 0.2
+
+
+@dataclass(frozen=True, kw_only=True)
+class SubjectModel:
+    """What is known about a person before the first instant."""
+
+    track_id: int
+    name: str
+    shape: BodyShape | None = None
+    """None: estimated from triangulated landmarks as they come."""
+    sites: ImuSites = field(default_factory=ImuSites.none)
+    start_m: tuple[float, float] | None = None
+    """x, z."""
+
+
+class Estimator:
+    """Tracks the pose of one subject."""
+
+    def __init__(
+        self,
+        model: SubjectModel,
+        *,
+        rig: Rig,
+        landmarks: LandmarkSet,
+        prior: PosePrior,
+        skeleton: Skeleton = PAPER21,
+        options: SolverOptions | None = None,
+    ) -> None:
+        self.model = model
+        self._rig = rig
+        self._landmarks = landmarks
+        self._prior = prior
+        self._measure = BodyMeasure(skeleton, landmarks) if model.shape is None else None
+        shape = model.shape or BodyShape.from_height(skeleton, _DEFAULT_HEIGHT_M)
+        self.solver = PoseSolver(
+            shape=shape,
+            rig=rig,
+            landmarks=landmarks,
+            prior=prior,
+            sites=model.sites,
+            options=options,
+        )
+        self._landmark_bones = landmarks.bones(skeleton)
+        self._solution: Solution | None = None
+        self._previous: Observation | None = None
+        self._sites: list[np.ndarray] = []
+        self._points: list[tuple[int, np.ndarray]] = []
+        self._last_start_ns = -(10**18)
+
+    @property
+    def shape(self) -> BodyShape:
+        """The body in use now."""
+        return self.solver.shape
+
+    def set_shape(self, shape: BodyShape) -> None:
+        """Fix the body; it is no longer estimated."""
+        self._measure = None
+        self.solver.set_shape(shape)
+
+    def predict(self, now_ns: int) -> Float[np.ndarray, "k 3"] | None:
+        """Landmarks in the world [m] at `now_ns` by constant velocity; None before the first pose.
+
+        Extrapolation stops after 0.2 s: a person unseen for longer is expected where last seen.
+        """
+        if not self._points:
+            return None
+        last_ns, last = self._points[-1]
+        if len(self._points) < 2:
+            return last
+        before_ns, before = self._points[0]
+        ahead_s = min((now_ns - last_ns) * 1e-9, _MAX_PREDICTION_S)
+        return last + (last - before) * (ahead_s / ((last_ns - before_ns) * 1e-9))
+
+    def update(
+        self,
+        observation: Observation,
+        landmarks_in_world_m: Float[np.ndarray, "k 3"] | None = None,
+    ) -> Estimate | None:
+        """The pose at this instant; None while nothing allows a first pose.
+
+        `landmarks_in_world_m` (NaN = missing) are triangulated landmarks of this instant: they
+        measure the body, place the first pose, and offer a second start when a solve ends badly.
+        With neither keypoints nor IMUs the pose is held and its quality is 0.
+        """
+        if landmarks_in_world_m is None:
+            landmarks_in_world_m = np.full((len(self._landmark_bones), 3), np.nan)
+        self._learn_shape(landmarks_in_world_m)
+        data = self._measurements(observation)
+        views = np.asarray(np.any(observation.keypoints[:, :, 2] > 0, axis=1))
+        has_imu = bool(np.isfinite(data.imu_rotation[:, 0, 0]).any())
+        started = time.perf_counter()
+        if self._solution is None:
+            solution = self._first(observation, data, landmarks_in_world_m)
+        elif views.any() or has_imu:
+            solution = self.solver.solve(self._solution.theta, data)
+            solution = self._better_start(observation, data, landmarks_in_world_m, solution)
+        else:
+            return self._held(observation.timestamp_ns, self._solution, views)
+        if solution is None:
+            return None
+        solve_s = time.perf_counter() - started
+        self._remember(observation, solution)
+        return self._estimate(observation.timestamp_ns, solution, views, solve_s)
+
+    def _first(
+        self, observation: Observation, data: Measurements, points: np.ndarray
+    ) -> Solution | None:
+        shape, prior, sites = self.solver.shape, self._prior, self.model.sites
+        starts = []
+        from_points = pose_from_landmarks(
+            shape, self._landmarks, prior, points, sites, data.imu_rotation
+        )
+        if from_points is not None:
+            starts = [from_points]
+        elif self.model.start_m is not None or not (observation.keypoints[:, :, 2] > 0).any():
+            x_m, z_m = self.model.start_m or (0.0, 0.0)
+            from_imus = pose_from_imus(shape, prior, sites, data.imu_rotation, x_m=x_m, z_m=z_m)
+            if from_imus is not None:
+                starts = [from_imus]
+            elif (observation.keypoints[:, :, 2] > 0).any():
+                starts = [
+                    neutral_pose(shape, prior, x_m=x_m, z_m=z_m, heading_rad=heading)
+                    for heading in np.arange(8) * np.pi / 4
+                ]
+        else:
+            starts = poses_from_one_view(shape, prior, self._rig, observation.keypoints)
+        solutions = [self.solver.solve(start, data) for start in starts]
+        self._last_start_ns = observation.timestamp_ns
+        return min(solutions, key=lambda s: s.cost) if solutions else None
+
+    def _better_start(
+        self, observation: Observation, data: Measurements, points: np.ndarray, found: Solution
+    ) -> Solution:
+        """`found`, or what a start from the triangulated landmarks reaches when that is better."""
+        seen = np.count_nonzero(observation.keypoints[:, :, 2] > 0)
+        due = observation.timestamp_ns - self._last_start_ns >= _RESTART_INTERVAL_S * 1e9
+        if found.cost <= _POOR_COST_PER_KEYPOINT * max(seen, 1) or not due:
+            return found
+        self._last_start_ns = observation.timestamp_ns
+        start = pose_from_landmarks(
+            self.solver.shape,
+            self._landmarks,
+            self._prior,
+            points,
+            self.model.sites,
+            data.imu_rotation,
+        )
+        if start is None:
+            return found
+        other = self.solver.solve(start, data)
+        # The solver's posed body and matrices belong to its last solve, but results are copies.
+        return other if other.cost < 0.9 * found.cost else found
+
+    def _learn_shape(self, points: np.ndarray) -> None:
+        if self._measure is None:
+            return
+        self._measure.add(points)
+        shape = self._measure.shape()
+        if shape is not None:
+            self.solver.set_shape(shape)
+
+    def _measurements(self, observation: Observation) -> Measurements:
+        count = len(self.model.sites.bone)
+        rotation = np.full((count, 3, 3), np.nan)
+        accel = np.full((count, 3), np.nan)
+        history = np.full((2, count, 3), np.nan)
+        dt_s = 1.0
+        if observation.imu is not None:
+            rotation = np.ascontiguousarray(observation.imu.bone_rotation_in_world)
+        if self._previous is not None:
+            dt_s = (observation.timestamp_ns - self._previous.timestamp_ns) * 1e-9
+            if self._previous.imu is not None and len(self._sites) == 2:
+                accel = np.ascontiguousarray(self._previous.imu.accel_in_world_m_s2)
+                history = np.stack([self._sites[1], self._sites[0]])
+        return Measurements(
+            keypoints=np.ascontiguousarray(observation.keypoints),
+            imu_rotation=rotation,
+            imu_accel=accel,
+            imu_history=history,
+            dt_s=dt_s,
+        )
+
+    def _remember(self, observation: Observation, solution: Solution) -> None:
+        position, rotation = solution.position_in_world_m, solution.rotation_in_world
+        bones = list(self.model.sites.bone)
+        site = position[bones] + np.einsum(
+            "iab,ib->ia", rotation[bones], self.model.sites.position_m
+        )
+        points = landmarks_in_world(
+            position[None], rotation[None], self._landmark_bones, self.solver.landmark_offsets_m
+        )[0]
+        self._previous = observation
+        self._sites = [*self._sites[-1:], site]
+        self._points = [*self._points[-2:], (observation.timestamp_ns, points)]
+        self._solution = solution
+
+    def _held(self, timestamp_ns: int, last: Solution, views: np.ndarray) -> Estimate:
+        """The last pose again; accelerations must not reach across the gap."""
+        self._sites = []
+        held = replace(last, bone_quality=np.zeros_like(last.bone_quality))
+        return self._estimate(timestamp_ns, held, views, 0.0)
+
+    def _estimate(
+        self, timestamp_ns: int, solution: Solution, views: Bool[np.ndarray, " c"], solve_s: float
+    ) -> Estimate:
+        return Estimate(
+            track_id=self.model.track_id,
+            name=self.model.name,
+            timestamp_ns=timestamp_ns,
+            theta=solution.theta,
+            bone_position_in_world_m=solution.position_in_world_m,
+            bone_rotation_in_world=solution.rotation_in_world,
+            bone_quality=solution.bone_quality,
+            shape=self.solver.shape,
+            status=solution.status,
+            iterations=solution.iterations,
+            cost=solution.cost,
+            solve_s=solve_s,
+            views=views,
+        )
