@@ -429,8 +429,18 @@ def drop_contradicting_views(
             for c in range(views):
                 if person[t, c] >= 0:
                     count += 1
-            # Two rays can pass so far from each other that no landmark survives.
-            apart = count == 2 and not np.isfinite(points_out[t, :, 0]).any()
+            # Two rays can pass so far from each other that hardly a landmark survives.
+            apart = False
+            if count == 2:
+                shared = found = 0
+                for k in range(landmarks):
+                    seeing = 0
+                    for c in range(views):
+                        if person[t, c] >= 0 and rays[person[t, c], k, 2] > 0.0:
+                            seeing += 1
+                    shared += seeing == 2
+                    found += math.isfinite(points_out[t, k, 0])
+                apart = shared >= min_common and found < min_common
             if count < 2 or (farthest <= max_distance_m and not apart):
                 break
             out = -1

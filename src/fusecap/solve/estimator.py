@@ -38,13 +38,13 @@ _POOR_COST_PER_KEYPOINT = 0.25
 off (s = 1 at λ = 1e-3 and full confidence) in a 1920-pixel-wide image."""
 _RESTART_INTERVAL_S = 0.25
 _MAX_PREDICTION_S = 0.2
+_RESTART_AFTER_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
 class SubjectModel:
     """What is known about a person before the first instant."""
 
-    track_id: int
     name: str
     shape: BodyShape | None = None
     """None: estimated from triangulated landmarks as they come."""
@@ -67,6 +67,8 @@ class Estimator:
         options: SolverOptions | None = None,
     ) -> None:
         self.model = model
+        self.track_id = -1
+        """The track that feeds this estimator now."""
         self._rig = rig
         self._landmarks = landmarks
         self._prior = prior
@@ -85,12 +87,28 @@ class Estimator:
         self._previous: Observation | None = None
         self._sites: list[np.ndarray] = []
         self._points: list[tuple[int, np.ndarray]] = []
-        self._last_start_ns = -(10**18)
+        self._last_start_ns = self._last_ns = -(10**18)
 
     @property
     def shape(self) -> BodyShape:
         """The body in use now."""
         return self.solver.shape
+
+    def follow(
+        self,
+        track_id: int,
+        observation: Observation,
+        landmarks_in_world_m: Float[np.ndarray, "k 3"] | None = None,
+    ) -> Estimate | None:
+        """`update` for a track; one that was away for a second starts from a fresh first pose."""
+        self.track_id = track_id
+        away_ns = observation.timestamp_ns - self._last_ns
+        if self._solution is not None and away_ns > _RESTART_AFTER_NS:
+            self._solution = None
+            self._previous = None
+            self._sites = []
+            self._points = []
+        return self.update(observation, landmarks_in_world_m)
 
     def set_shape(self, shape: BodyShape) -> None:
         """Fix the body; it is no longer estimated."""
@@ -122,6 +140,7 @@ class Estimator:
         measure the body, place the first pose, and offer a second start when a solve ends badly.
         With neither keypoints nor IMUs the pose is held and its quality is 0.
         """
+        self._last_ns = observation.timestamp_ns
         if landmarks_in_world_m is None:
             landmarks_in_world_m = np.full((len(self._landmark_bones), 3), np.nan)
         self._learn_shape(landmarks_in_world_m)
@@ -244,7 +263,7 @@ class Estimator:
         self, timestamp_ns: int, solution: Solution, views: Bool[np.ndarray, " c"], solve_s: float
     ) -> Estimate:
         return Estimate(
-            track_id=self.model.track_id,
+            track_id=self.track_id,
             name=self.model.name,
             timestamp_ns=timestamp_ns,
             theta=solution.theta,

@@ -1,0 +1,95 @@
+"""What a human body can measure: limbs whose length does not depend on the pose.
+
+Lengths come from the reference proportions of `BodyShape` for people of 1.0 m to 2.2 m, widened by
+40 % because a detector's joints scatter by some centimetres and trunks bend. An adult's thigh (0.43
+m) may so measure 0.15 m to 0.75 m, an upper arm 0.11 m to 0.57 m, and a trunk from shoulder to hip
+0.18 m to 0.93 m: wide enough for everybody, narrow enough to refuse most skeletons that two different
+people's rays make.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float
+
+from fusecap.body.landmarks import LandmarkSet
+from fusecap.body.pose import forward_kinematics, landmarks_in_world
+from fusecap.body.shape import BodyShape
+from fusecap.body.skeleton import PAPER21
+
+_SHORTEST_M, _TALLEST_M, _TOLERANCE = 1.0, 2.2, 0.4
+
+_RIGID_PAIRS = (
+    ("left_shoulder", "right_shoulder"),
+    ("left_hip", "right_hip"),
+    ("neck", "mid_hip"),
+    *(
+        (f"{side}_{upper}", f"{side}_{lower}")
+        for side in ("left", "right")
+        for upper, lower in (
+            ("shoulder", "elbow"),
+            ("elbow", "wrist"),
+            ("hip", "knee"),
+            ("knee", "ankle"),
+            ("shoulder", "hip"),
+        )
+    ),
+)
+_TORSO = ("left_shoulder", "right_shoulder", "left_hip", "right_hip", "neck", "mid_hip", "chest")
+
+MIN_LIMBS = 4
+"""Limbs that must be measured before a body is judged; a trunk with one arm or leg has as many."""
+
+
+class Anatomy:
+    """Limb lengths and the torso for one detector's landmarks."""
+
+    def __init__(self, landmark_set: LandmarkSet) -> None:
+        names = landmark_set.landmark_names
+        self._limbs = np.array(
+            [
+                (names.index(a), names.index(b))
+                for a, b in _RIGID_PAIRS
+                if a in names and b in names
+            ]
+        )
+        self._torso = np.array([names.index(name) for name in _TORSO if name in names])
+        self._landmark_set = landmark_set
+
+    @cached_property
+    def _fractions(self) -> np.ndarray:
+        shape = BodyShape.from_height(PAPER21, 1.0)
+        position, rotation = forward_kinematics(shape, np.zeros((1, PAPER21.pose_size)))
+        bones = self._landmark_set.bones(PAPER21)
+        offsets = self._landmark_set.offsets_m(shape)
+        return self.limb_lengths(landmarks_in_world(position, rotation, bones, offsets)[0])
+
+    @property
+    def limb_count(self) -> int:
+        """Number of limbs that `limb_lengths` measures."""
+        return len(self._limbs)
+
+    def limb_lengths(self, landmarks: Float[np.ndarray, "*t k 3"]) -> Float[np.ndarray, "*t m"]:
+        """Lengths [m]; NaN where an end is."""
+        ends = landmarks[..., self._limbs, :]
+        limb = ends[..., 0, :] - ends[..., 1, :]
+        return np.sqrt(np.einsum("...i,...i->...", limb, limb))
+
+    def possible(self, landmarks: Float[np.ndarray, "h k 3"]) -> np.ndarray:
+        """Which skeletons (h,) have enough limbs, at least three quarters of them of human size."""
+        lengths = self.limb_lengths(landmarks)
+        low = self._fractions * _SHORTEST_M * (1 - _TOLERANCE)
+        high = self._fractions * _TALLEST_M * (1 + _TOLERANCE)
+        measured = np.isfinite(lengths).sum(axis=-1)
+        human = ((lengths >= low) & (lengths <= high)).sum(axis=-1)
+        return (measured >= MIN_LIMBS) & (human >= 0.75 * measured)
+
+    def centre(self, landmarks: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "3"]:
+        """Middle of the torso [m], of all landmarks where it was not seen; NaN without any."""
+        torso = landmarks[self._torso]
+        torso = torso[np.isfinite(torso[:, 0])]
+        if len(torso) == 0:
+            torso = landmarks[np.isfinite(landmarks[:, 0])]
+        return torso.sum(axis=0) / len(torso) if len(torso) else np.full(3, np.nan)

@@ -1,0 +1,61 @@
+"""The motion that ships: three people for twelve seconds, as truncated cosine series.
+
+Root positions and the components of sign-continuous quaternions are smooth in time, so 8 Hz of
+cosines carry them:
+
+    x(t) = Σ_k c_k cos(π k t / D)
+
+A series is flat at both ends of its interval D; the motion is taken from its inside.
+"""
+
+from __future__ import annotations
+
+from importlib import resources
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from fusecap.errors import InputError
+
+
+class DemoMotion(NamedTuple):
+    """S people over T frames, for skeleton `paper21` at 1.75 m."""
+
+    names: tuple[str, ...]
+    """The subjects first, the bystander last."""
+    rate_hz: float
+    theta: Float[np.ndarray, "s t 66"]
+    """Angles at most pi; within a 4 x 4 m area round the origin but for the bystander."""
+
+
+def load_demo_motion() -> DemoMotion:
+    """The motion in `fusecap.data`; raises `InputError` where it is missing."""
+    source = resources.files("fusecap.data") / "demo_motion.npz"
+    if not source.is_file():
+        raise InputError(f"no demo motion at {source}; the installation is incomplete")
+    with source.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+        names = tuple(str(name) for name in stored["names"])
+        rate_hz = float(stored["rate_hz"])
+        time_s = float(stored["start_s"]) + np.arange(int(stored["frames"])) / rate_hz
+        coefficients = stored["coefficients"].astype(np.float64)
+        interval_s = float(stored["interval_s"])
+    channels = np.stack([evaluate_series(c, interval_s, time_s) for c in coefficients])
+    return DemoMotion(names=names, rate_hz=rate_hz, theta=theta_of_channels(channels))
+
+
+def evaluate_series(
+    coefficients: Float[np.ndarray, "k c"], interval_s: float, time_s: Float[np.ndarray, " t"]
+) -> Float[np.ndarray, "t c"]:
+    """x(t) above at the given times."""
+    orders = np.arange(len(coefficients))
+    return np.cos(np.pi / interval_s * np.outer(time_s, orders)) @ coefficients
+
+
+def theta_of_channels(channels: Float[np.ndarray, "s t c"]) -> Float[np.ndarray, "s t p"]:
+    """Poses from root position [m] and one quaternion wxyz of any length per bone, c = 3 + 4B."""
+    people, frames = channels.shape[:2]
+    quaternions = channels[..., 3:].reshape(-1, 4)
+    vectors = Rotation.from_quat(quaternions[:, [1, 2, 3, 0]]).as_rotvec()
+    return np.concatenate([channels[..., :3], vectors.reshape(people, frames, -1)], axis=-1)

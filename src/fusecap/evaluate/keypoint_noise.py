@@ -1,0 +1,316 @@
+"""What a 2D detector would have seen: images of landmarks, with the faults that detectors have.
+
+Bodies are capsules around their bones. A landmark whose line of sight passes through a capsule, its
+own body's or another's, counts as occluded when it lies deeper than the capsule; the detector then
+guesses it, badly, or misses it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from fusecap.body.landmarks import LandmarkSet
+from fusecap.body.pose import forward_kinematics, landmarks_in_world
+from fusecap.body.shape import REFERENCE_HEIGHT_M, BodyShape, end_offsets_m
+from fusecap.body.skeleton import PAPER21
+from fusecap.evaluate.noise import bursts, correlated_noise
+from fusecap.geometry.camera import Camera
+
+APPARENT_HEIGHT_PX = 600.0
+"""Size in the image at which `KeypointNoise.sigma_px` holds."""
+
+_CAPSULES = [("hips", "neck", 0.075), ("head", "", 0.045)] + [
+    (f"{side}_{bone}", f"{side}_{child}" if child else "", radius)
+    for side in ("left", "right")
+    for bone, child, radius in (
+        ("upper_arm", "forearm", 0.027),
+        ("forearm", "hand", 0.022),
+        ("thigh", "shank", 0.045),
+        ("shank", "foot", 0.032),
+        ("foot", "toes", 0.020),
+    )
+]
+"""Bone where a capsule starts, bone where it ends (none: the bone's own end), radius by stature."""
+
+_SWAPPED_TOGETHER = {
+    "arms": ("shoulder", "elbow", "wrist"),
+    "legs": ("hip", "knee", "ankle", "big_toe", "small_toe", "heel"),
+}
+_CHUNK = 256
+
+
+@dataclass(frozen=True, kw_only=True)
+class KeypointNoise:
+    """A detector's faults. A share is a probability per frame; its seconds are the mean run."""
+
+    sigma_px: float = 4.0
+    """Per axis, for a person who appears 600 px tall; grows with apparent size."""
+    correlation_s: float = 0.1
+    landmark_bias_m: float = 0.010
+    """Per axis: constant distance of each person's landmarks from the default offsets."""
+    miss_share: float = 0.03
+    """Of keypoints."""
+    miss_s: float = 0.1
+    occluded_seen_share: float = 0.5
+    """Of occluded keypoints: guessed, not missed."""
+    occluded_sigma_factor: float = 3.0
+    person_miss_share: float = 0.02
+    """Of people, in each view."""
+    person_miss_s: float = 0.3
+    swap_share: float = 0.01
+    """Of people's arms, and of their legs, in each view: left taken for right."""
+    swap_s: float = 0.15
+    outlier_share: float = 0.01
+    """Of keypoints: anywhere in the person's box."""
+    outlier_s: float = 0.05
+    spurious_share: float = 0.05
+    """Of views: a picture on the wall taken for a person."""
+    spurious_s: float = 0.5
+    confidence_sigma: float = 0.05
+    """Of confidence about the value that belongs to the error."""
+    min_keypoints: int = 4
+    """People with fewer visible keypoints are not detected."""
+
+
+NO_KEYPOINT_NOISE = KeypointNoise(
+    sigma_px=0.0,
+    landmark_bias_m=0.0,
+    miss_share=0.0,
+    occluded_seen_share=1.0,
+    occluded_sigma_factor=1.0,
+    person_miss_share=0.0,
+    swap_share=0.0,
+    outlier_share=0.0,
+    spurious_share=0.0,
+    confidence_sigma=0.0,
+)
+"""Every landmark that projects into the image, where it is."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Capsules:
+    """The solid parts of P people: Q segments with radii, over T frames."""
+
+    start_in_world_m: Float[np.ndarray, "t q 3"]
+    end_in_world_m: Float[np.ndarray, "t q 3"]
+    radius_m: Float[np.ndarray, " q"]
+
+
+def body_capsules(
+    shape: BodyShape,
+    position_in_world_m: Float[np.ndarray, "t b 3"],
+    rotation_in_world: Float[np.ndarray, "t b 3 3"],
+) -> Capsules:
+    """The capsules of one body in motion."""
+    bone = shape.skeleton.bone
+    ends = end_offsets_m(shape)
+    start = [position_in_world_m[:, bone(name)] for name, _, _ in _CAPSULES]
+    end = [
+        position_in_world_m[:, bone(child)]
+        if child
+        else position_in_world_m[:, bone(name)] + rotation_in_world[:, bone(name)] @ ends[name]
+        for name, child, _ in _CAPSULES
+    ]
+    return Capsules(
+        start_in_world_m=np.stack(start, axis=1),
+        end_in_world_m=np.stack(end, axis=1),
+        radius_m=np.array([radius for _, _, radius in _CAPSULES]) * shape.height_m,
+    )
+
+
+def together(capsules: Sequence[Capsules]) -> Capsules:
+    """Everyone's capsules as one set."""
+    return Capsules(
+        start_in_world_m=np.concatenate([c.start_in_world_m for c in capsules], axis=1),
+        end_in_world_m=np.concatenate([c.end_in_world_m for c in capsules], axis=1),
+        radius_m=np.concatenate([c.radius_m for c in capsules]),
+    )
+
+
+def occluded(
+    camera: Camera, points_in_world_m: Float[np.ndarray, "t n 3"], capsules: Capsules
+) -> Bool[np.ndarray, "t n"]:
+    """Which points lie behind a capsule, by more than half its radius, as this camera sees it."""
+    hidden = np.empty(points_in_world_m.shape[:2], dtype=bool)
+    for first in range(0, len(points_in_world_m), _CHUNK):
+        rows = slice(first, first + _CHUNK)
+        point, depth = _seen(camera, points_in_world_m[rows])
+        start, start_depth = _seen(camera, capsules.start_in_world_m[rows])
+        end, end_depth = _seen(camera, capsules.end_in_world_m[rows])
+        axis = end - start
+        length2 = np.maximum((axis**2).sum(axis=-1), 1e-12)
+        offset = point[:, :, None] - start[:, None]
+        along = offset[..., 0] * axis[:, None, :, 0] + offset[..., 1] * axis[:, None, :, 1]
+        along = np.clip(along / length2[:, None], 0.0, 1.0)
+        offset -= along[..., None] * axis[:, None]
+        capsule_depth = 1.0 / (
+            1.0 / start_depth[:, None] + along * (1.0 / end_depth - 1.0 / start_depth)[:, None]
+        )
+        radius = capsules.radius_m.astype(np.float32)
+        across = np.hypot(offset[..., 0], offset[..., 1]) * capsule_depth
+        behind = depth[:, :, None] - capsule_depth > 0.5 * radius
+        hidden[rows] = ((across < radius) & behind).any(axis=-1)
+    return hidden
+
+
+def _seen(
+    camera: Camera, points_in_world_m: Float[np.ndarray, "t n 3"]
+) -> tuple[Float[np.ndarray, "t n 2"], Float[np.ndarray, "t n"]]:
+    """Normalised image coordinates and depth [m], in single precision."""
+    in_cam = (points_in_world_m @ camera.rotation.T + camera.translation).astype(np.float32)
+    depth = np.maximum(in_cam[..., 2], np.float32(0.05))
+    return in_cam[..., :2] / depth[..., None], depth
+
+
+def detect(
+    rng: np.random.Generator,
+    camera: Camera,
+    landmark_set: LandmarkSet,
+    landmarks_in_world_m: Float[np.ndarray, "t p k 3"],
+    heights_m: Float[np.ndarray, " p"],
+    capsules: Capsules,
+    noise: KeypointNoise,
+    rate_hz: float,
+) -> list[tuple[Float[np.ndarray, "n k 3"], Int[np.ndarray, " n"]]]:
+    """Per frame one camera's keypoints (x px, y px, confidence), and whose they are (-1: nobody's).
+
+    People come in random order.
+    """
+    frames, people, count = landmarks_in_world_m.shape[:3]
+    points = landmarks_in_world_m.reshape(frames, people * count, 3)
+    pixels = camera.project(points.reshape(-1, 3)).reshape(frames, people, count, 2)
+    hidden = occluded(camera, points, capsules).reshape(frames, people, count)
+    depth = (points @ camera.rotation[2] + camera.translation[2]).reshape(frames, people, count)
+    apparent_px = camera.matrix[0, 0] * heights_m / np.maximum(np.median(depth, axis=2), 0.1)
+
+    unit = correlated_noise(rng, frames, (people, count, 2), noise.correlation_s * rate_hz)
+    sigma_px = noise.sigma_px * apparent_px[..., None] / APPARENT_HEIGHT_PX
+    sigma_px = sigma_px * np.where(hidden, noise.occluded_sigma_factor, 1.0)
+    pixels = pixels + unit * sigma_px[..., None]
+    confidence = 0.95 * np.exp(-(unit**2).sum(axis=-1) / 18.0) * np.where(hidden, 0.5, 1.0)
+    confidence += noise.confidence_sigma * rng.standard_normal(confidence.shape)
+
+    pixels = _swap_sides(rng, pixels, landmark_set, noise, rate_hz)
+    outlier = bursts(
+        rng,
+        frames,
+        (people, count),
+        share=noise.outlier_share,
+        mean_frames=noise.outlier_s * rate_hz,
+    )
+    low, high = _boxes(pixels)
+    anywhere = low + rng.random(pixels.shape) * (high - low)
+    pixels = np.where(outlier[..., None], anywhere, pixels)
+    confidence = np.where(outlier, rng.uniform(0.1, 0.6, confidence.shape), confidence)
+
+    missed = bursts(
+        rng, frames, (people, count), share=noise.miss_share, mean_frames=noise.miss_s * rate_hz
+    )
+    guessed = bursts(
+        rng,
+        frames,
+        (people, count),
+        share=noise.occluded_seen_share,
+        mean_frames=noise.miss_s * rate_hz,
+    )
+    visible = ~missed & (guessed | ~hidden) & _inside(camera, pixels)
+    person_missed = bursts(
+        rng,
+        frames,
+        (people,),
+        share=noise.person_miss_share,
+        mean_frames=noise.person_miss_s * rate_hz,
+    )
+    detected = (visible.sum(axis=2) >= noise.min_keypoints) & ~person_missed
+    found = np.concatenate([pixels, np.clip(confidence, 0.05, 1.0)[..., None]], axis=-1)
+    found[~visible] = 0.0
+
+    picture, shown = _picture_on_the_wall(rng, camera, landmark_set, frames, noise, rate_hz)
+    result = []
+    for frame in range(frames):
+        whose = np.flatnonzero(detected[frame])
+        keypoints = found[frame, whose]
+        if shown[frame]:
+            whose = np.append(whose, -1)
+            keypoints = np.concatenate([keypoints, picture[frame, None]])
+        order = rng.permutation(len(whose))
+        result.append((keypoints[order], whose[order]))
+    return result
+
+
+def _inside(camera: Camera, pixels: Float[np.ndarray, "*n 2"]) -> Bool[np.ndarray, "*n"]:
+    width, height = camera.size_px
+    with np.errstate(invalid="ignore"):
+        return (
+            (pixels[..., 0] >= 0)
+            & (pixels[..., 0] <= width - 1)
+            & (pixels[..., 1] >= 0)
+            & (pixels[..., 1] <= height - 1)
+        )
+
+
+def _boxes(
+    pixels: Float[np.ndarray, "t p k 2"],
+) -> tuple[Float[np.ndarray, "t p 1 2"], Float[np.ndarray, "t p 1 2"]]:
+    """Corners of each person's box; inside out, hence never drawn from, where nothing is imaged."""
+    low = np.where(np.isnan(pixels), np.inf, pixels).min(axis=2, keepdims=True)
+    high = np.where(np.isnan(pixels), -np.inf, pixels).max(axis=2, keepdims=True)
+    empty = low > high
+    return np.where(empty, -1.0, low), np.where(empty, -1.0, high)
+
+
+def _swap_sides(
+    rng: np.random.Generator,
+    pixels: Float[np.ndarray, "t p k 2"],
+    landmark_set: LandmarkSet,
+    noise: KeypointNoise,
+    rate_hz: float,
+) -> Float[np.ndarray, "t p k 2"]:
+    frames, people = pixels.shape[:2]
+    for parts in _SWAPPED_TOGETHER.values():
+        swapped = bursts(
+            rng,
+            frames,
+            (people,),
+            share=noise.swap_share,
+            mean_frames=noise.swap_s * rate_hz,
+        )
+        belongs = np.array(
+            [name.partition("_")[2] in parts for name in landmark_set.landmark_names]
+        )
+        pixels = np.where(
+            (swapped[..., None] & belongs)[..., None], pixels[:, :, landmark_set.mirror], pixels
+        )
+    return pixels
+
+
+def _picture_on_the_wall(
+    rng: np.random.Generator,
+    camera: Camera,
+    landmark_set: LandmarkSet,
+    frames: int,
+    noise: KeypointNoise,
+    rate_hz: float,
+) -> tuple[Float[np.ndarray, "t k 3"], Bool[np.ndarray, " t"]]:
+    """A standing figure at one place, a quarter of the image tall, and when it is detected."""
+    shape = BodyShape.from_height(PAPER21, REFERENCE_HEIGHT_M)
+    position, rotation = forward_kinematics(shape, np.zeros((1, PAPER21.pose_size)))
+    offsets = landmark_set.offsets_m(shape)
+    points = landmarks_in_world(position, rotation, landmark_set.bones(PAPER21), offsets)[0]
+    figure = points[:, :2] * [1.0, -1.0]
+    width, height = camera.size_px
+    tall_px = 0.25 * height
+    place = rng.uniform([tall_px, tall_px], [width - tall_px, height - tall_px])
+    count = len(figure)
+    keypoints = np.empty((frames, count, 3))
+    keypoints[..., :2] = place + figure * tall_px / REFERENCE_HEIGHT_M
+    keypoints[..., :2] += 2.0 * rng.standard_normal((frames, count, 2))
+    keypoints[..., 2] = rng.uniform(0.1, 0.5, (frames, count))
+    shown = bursts(
+        rng, frames, (), share=noise.spurious_share, mean_frames=noise.spurious_s * rate_hz
+    )
+    return keypoints, shown

@@ -1,0 +1,156 @@
+"""A simulation written as a session folder, for `fusecap solve` and for readers' tests.
+
+session.toml   calibration.toml   truth.npz
+keypoints/<camera>/<camera>_<frame>_keypoints.json        OpenPose
+imus/<subject>_<bone>.csv        time_s, qw, qx, qy, qz (imu_world_from_imu, y up), ax, ay, az
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from fusecap.errors import InputError
+from fusecap.evaluate.imu_noise import SimulatedImus
+from fusecap.evaluate.simulator import Person, Simulation
+from fusecap.geometry.camera import Rig
+from fusecap.sinks.files import safe_name, written_whole
+from fusecap.sinks.take import save_take
+
+
+def write_session(simulation: Simulation, folder: Path | str) -> Path:
+    """Write everything; returns the path of `session.toml`, which is written last."""
+    folder = Path(folder)
+    _write(folder / "calibration.toml", calibration_toml(simulation.rig))
+    for camera, name in enumerate(simulation.rig.names):
+        for frame, detections in enumerate(simulation.detections):
+            _write(
+                folder / "keypoints" / name / f"{name}_{frame:012d}_keypoints.json",
+                _openpose_json(detections.people[camera]),
+            )
+    for subject, imus in simulation.imus.items():
+        for sensor, bone in enumerate(imus.bones):
+            _write(folder / _imu_file(subject, bone), _imu_csv(simulation, imus, sensor))
+    save_take(simulation.truth, folder / "truth.npz")
+    path = folder / "session.toml"
+    with written_whole(path) as file:
+        file.write(_session_toml(simulation).encode())
+    return path
+
+
+def calibration_toml(rig: Rig) -> str:
+    """The rig in the aniposelib layout, metres."""
+    tables = []
+    for index, camera in enumerate(rig.cameras):
+        rotation = Rotation.from_matrix(camera.rotation).as_rotvec()
+        tables.append(
+            f"[cam_{index}]\n"
+            f"name = {_text(camera.name)}\n"
+            f"size = {list(camera.size_px)}\n"
+            f"matrix = {camera.matrix.tolist()}\n"
+            f"distortions = {camera.distortion.tolist()}\n"
+            f"rotation = {rotation.tolist()}\n"
+            f"translation = {camera.translation.tolist()}\n"
+        )
+    return "\n".join(tables)
+
+
+def _session_toml(simulation: Simulation) -> str:
+    fmt = f"openpose-{simulation.landmark_set.name}"
+    head = [
+        f"# Simulated; seed {simulation.seed}. The truth is in truth.npz.",
+        "[session]",
+        f"name = {_text(simulation.name)}",
+        f"rate_hz = {simulation.rate_hz!r}",
+        'calibration = "calibration.toml"',
+        'up = "y"',
+        "floor = true",
+        f"max_subjects = {len(simulation.subjects)}",
+    ]
+    if simulation.volume_m is not None:
+        head.append(f"volume_m = {list(simulation.volume_m)}")
+    tables = ["\n".join(head) + "\n"]
+    tables += [
+        "[[camera]]\n"
+        f"name = {_text(name)}\n"
+        f"keypoints = {_text(f'keypoints/{name}')}\n"
+        f'format = "{fmt}"\n'
+        f"rate_hz = {simulation.rate_hz!r}\n"
+        "offset_s = 0.0\n"
+        for name in simulation.rig.names
+    ]
+    for person in simulation.subjects:
+        tables.append(_subject_toml(person))
+        if person.name in simulation.imus:
+            tables += _imu_toml(person.name, simulation.imus[person.name])
+    return "\n".join(tables)
+
+
+def _subject_toml(person: Person) -> str:
+    start = np.round(person.theta[0, [0, 2]], 2).tolist()
+    return (
+        "[[subject]]\n"
+        f"name = {_text(person.name)}\n"
+        f"height_m = {person.shape.height_m!r}\n"
+        f"start_m = {start}\n"
+    )
+
+
+def _imu_toml(subject: str, imus: SimulatedImus) -> list[str]:
+    quaternion = _wxyz(imus.bone_from_imu)
+    return [
+        "[[subject.imu]]\n"
+        f"bone = {_text(bone)}\n"
+        f"file = {_text(_imu_file(subject, bone))}\n"
+        'format = "csv"\n'
+        f"bone_from_imu_wxyz = {quaternion[sensor].tolist()}\n"
+        f"position_m = {imus.position_in_bone_m[sensor].tolist()}\n"
+        'imu_up = "y"\n'
+        for sensor, bone in enumerate(imus.bones)
+    ]
+
+
+def _imu_file(subject: str, bone: str) -> str:
+    return f"imus/{safe_name(subject)}_{bone}.csv"
+
+
+def _imu_csv(simulation: Simulation, imus: SimulatedImus, sensor: int) -> str:
+    time_s = simulation.truth.timestamps_ns * 1e-9
+    quaternion = _wxyz(imus.world_from_imu[:, sensor])
+    rows = np.column_stack([time_s, quaternion, imus.accel_m_s2[:, sensor]])
+    lines = ["time_s,qw,qx,qy,qz,ax,ay,az"]
+    lines += [",".join(f"{value:.9f}" for value in row) for row in rows]
+    return "\n".join(lines) + "\n"
+
+
+def _openpose_json(people: Float[np.ndarray, "n k 3"]) -> str:
+    return json.dumps(
+        {
+            "version": 1.3,
+            "people": [
+                {"person_id": [-1], "pose_keypoints_2d": np.round(person, 3).ravel().tolist()}
+                for person in people
+            ],
+        }
+    )
+
+
+def _wxyz(rotation: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 4"]:
+    return np.roll(Rotation.from_matrix(rotation).as_quat(canonical=True), 1, axis=1)
+
+
+def _text(value: str) -> str:
+    """A TOML string; JSON's escapes are TOML's."""
+    return json.dumps(value, ensure_ascii=False)
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {error.strerror}") from error

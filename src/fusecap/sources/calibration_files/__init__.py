@@ -1,0 +1,6 @@
+"""Calibration files: one module per format, recognised by content rather than asked for."""
+
+from fusecap.sources.calibration_files.loader import load_rig
+from fusecap.sources.calibration_files.plausibility import check_rig
+
+__all__ = ["check_rig", "load_rig"]

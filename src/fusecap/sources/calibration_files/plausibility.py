@@ -1,0 +1,86 @@
+"""Calibrations that no room can hold: wrong unit, wrong up axis, inverted extrinsics."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fusecap.geometry.camera import Rig
+from fusecap.sources.findings import Finding
+
+MILLIMETRES_ABOVE = 100.0
+"""Cameras whose median distance exceeds this are not given in metres."""
+SAME_PLACE_M = 0.005
+BELOW_FLOOR_M = -0.3
+
+
+def camera_spread(rig: Rig) -> float:
+    """Median distance between cameras; of a single camera, its distance from the origin."""
+    centres = np.array([camera.position_in_world for camera in rig.cameras])
+    if len(centres) < 2:
+        return float(np.linalg.norm(centres)) if len(centres) else 0.0
+    first, second = np.triu_indices(len(centres), 1)
+    return float(np.median(np.linalg.norm(centres[first] - centres[second], axis=1)))
+
+
+def check_rig(rig: Rig, *, floor: bool = True) -> list[Finding]:
+    """Warnings about a rig in our y-up world; `floor` says that y = 0 is one."""
+    findings = []
+    centres = {camera.name: camera.position_in_world for camera in rig.cameras}
+    names = list(centres)
+    for i, first in enumerate(names):
+        for second in names[i + 1 :]:
+            if np.linalg.norm(centres[first] - centres[second]) < SAME_PLACE_M:
+                findings.append(
+                    Finding(
+                        severity="warning",
+                        where=f"cameras '{first}' and '{second}'",
+                        found="stand at the same place, so they give no depth",
+                        remedy="calibrate the extrinsics again",
+                    )
+                )
+    if len(rig) == 0:
+        return findings
+    down = np.array([camera.rotation[1] for camera in rig.cameras])
+    if np.mean(down[:, 1]) > 0.3:
+        findings.append(
+            Finding(
+                severity="warning",
+                where="calibration",
+                found="the cameras hang upside down",
+                remedy='check up in [session]: "y", "z" or "-y" of the calibration\'s world',
+            )
+        )
+    low = [name for name, centre in centres.items() if centre[1] < BELOW_FLOOR_M]
+    if floor and low:
+        findings.append(
+            Finding(
+                severity="warning",
+                where=f"{len(low)} of {len(rig)} cameras ({', '.join(low[:5])})",
+                found=f"lie up to {-min(centres[name][1] for name in low):.2f} m below the floor",
+                remedy="check up in [session], put the origin on the floor, or set floor = false",
+            )
+        )
+    if len(rig) > 1 and not _look_at_each_other(rig):
+        findings.append(
+            Finding(
+                severity="warning",
+                where="calibration",
+                found="the cameras look away from a common volume",
+                remedy="the extrinsics may be inverted (world_from_cam instead of cam_from_world) "
+                "or a sign flipped",
+            )
+        )
+    return findings
+
+
+def _look_at_each_other(rig: Rig) -> bool:
+    """Whether the point nearest to all optical axes lies before most cameras."""
+    axes = np.array([camera.rotation[2] for camera in rig.cameras])
+    centres = np.array([camera.position_in_world for camera in rig.cameras])
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    total = across.sum(0)
+    if np.linalg.cond(total) > 1e6:
+        return True
+    common = np.linalg.solve(total, np.einsum("cij,cj->i", across, centres))
+    ahead = np.einsum("cj,cj->c", axes, common - centres)
+    return bool(np.mean(ahead > 0) >= 0.5)

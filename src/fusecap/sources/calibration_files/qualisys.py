@@ -1,0 +1,88 @@
+"""Qualisys Track Manager's `.qca.txt`.
+
+R, p = transform r11..r33, x y z [mm]        p: the camera's centre
+rotation = diag(1, -1, -1) R                  its cameras look along -z with y up
+translation = -rotation p / 1000
+fx, fy, cx, cy = value / 64                   its pixels are cut into 64ths
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from fusecap.errors import CalibrationError
+from fusecap.geometry.camera import Camera
+from fusecap.sources import safe_xml
+from fusecap.sources.calibration_files import fields
+
+SUBPIXELS = 64.0
+
+
+def read(path: Path) -> list[Camera]:
+    """The active cameras, translations in metres; raises `CalibrationError`."""
+    try:
+        root = safe_xml.parse(path)
+    except safe_xml.XmlError as error:
+        raise CalibrationError(f"{path}: {error}") from None
+    return [
+        _camera(path, element)
+        for element in root.iterfind("./cameras/camera")
+        if element.get("active", "1") == "1"
+    ]
+
+
+def _camera(path: Path, element: ElementTree.Element) -> Camera:
+    name = element.get("serial", "")
+    where = f"{path}: camera '{name}'"
+    if element.get("viewrotation", "0") != "0":
+        raise CalibrationError(
+            f"{where} has viewrotation {element.get('viewrotation')}, expected 0; export the "
+            "calibration and the videos unrotated"
+        )
+    transform = _attributes(element, "transform", where)
+    intrinsic = _attributes(element, "intrinsic", where)
+    view = _attributes(element, "fov_video", where)
+
+    def value(attributes: dict[str, str], key: str) -> float:
+        return float(fields.numbers(attributes.get(key), (1,), f"{where} {key}")[0])
+
+    if "fisheye" in element.get("model", "").lower():
+        raise CalibrationError(f"{where} is a fisheye lens, which is not supported")
+    left, top = value(view, "left"), value(view, "top")
+    in_file = np.array(
+        [[value(transform, f"r{row}{column}") for column in (1, 2, 3)] for row in (1, 2, 3)]
+    )
+    rotation = np.diag([1.0, -1.0, -1.0]) @ in_file
+    centre_m = np.array([value(transform, axis) for axis in "xyz"]) / 1000.0
+    matrix = np.eye(3)
+    matrix[0, 0] = value(intrinsic, "focalLengthU") / SUBPIXELS
+    matrix[1, 1] = value(intrinsic, "focalLengthV") / SUBPIXELS
+    matrix[0, 2] = value(intrinsic, "centerPointU") / SUBPIXELS - left
+    matrix[1, 2] = value(intrinsic, "centerPointV") / SUBPIXELS - top
+    return fields.camera(
+        path,
+        name=name,
+        size_px=np.array([value(view, "right") - left + 1, value(view, "bottom") - top + 1]),
+        matrix=matrix,
+        distortion=np.array(
+            [
+                value(intrinsic, "radialDistortion1"),
+                value(intrinsic, "radialDistortion2"),
+                value(intrinsic, "tangentalDistortion1"),
+                value(intrinsic, "tangentalDistortion2"),
+                value(intrinsic, "radialDistortion3"),
+            ]
+        ),
+        rotation=rotation,
+        translation=-rotation @ centre_m,
+    )
+
+
+def _attributes(element: ElementTree.Element, tag: str, where: str) -> dict[str, str]:
+    found = element.find(tag)
+    if found is None:
+        raise CalibrationError(f"{where} has no <{tag}>")
+    return dict(found.attrib)

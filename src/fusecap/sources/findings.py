@@ -1,0 +1,26 @@
+"""What a check says: something is wrong somewhere, and this is what to do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+Severity = Literal["error", "warning", "info"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Finding:
+    """One remark about a session; an `error` means that it cannot be solved as it is."""
+
+    severity: Severity
+    where: str
+    """File, camera, subject or sensor."""
+    found: str
+    remedy: str
+
+    def __str__(self) -> str:
+        return (
+            f"{self.where}: {self.found}; {self.remedy}"
+            if self.remedy
+            else (f"{self.where}: {self.found}")
+        )

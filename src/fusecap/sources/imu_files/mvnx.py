@@ -1,0 +1,72 @@
+"""Xsens MVN `.mvnx`, versions 3 and 4: XML with one element per frame.
+
+`sensorOrientation` (w, x, y, z per sensor) is imu_world (z up) from imu. Version 4 has
+`sensorFreeAcceleration`: without gravity, in the imu world. Version 3 has `sensorAcceleration`:
+specific force in the imu frame. Poses for calibration (identity, npose, tpose) are no samples.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from fusecap.errors import InputError
+from fusecap.sources import safe_xml
+from fusecap.sources.imu_files.sensors import chosen
+from fusecap.sources.imu_files.table import number
+from fusecap.sources.imu_files.track import ImuTrack, specific_force, tidy
+
+
+def read(path: Path, sensor: str | None) -> ImuTrack:
+    """The samples of one sensor; raises `InputError`."""
+    root = _root(path)
+    names = _names(root)
+    name = chosen(path, sensor, names)
+    index = names.index(name)
+    frames = [f for f in root.iterfind(".//{*}frames/{*}frame") if f.get("type") == "normal"]
+    if not frames:
+        raise InputError(f"{path}: no frame of type 'normal'; export the recording again")
+    quaternion = _vectors(frames, "sensorOrientation", index, 4)
+    force = _vectors(frames, "sensorAcceleration", index, 3)
+    free = _vectors(frames, "sensorFreeAcceleration", index, 3)
+    if np.all(np.isnan(force)):
+        force = specific_force(quaternion, free)
+    return tidy(f"{path} sensor '{name}'", _times_s(root, frames), quaternion, force)
+
+
+def sensors(path: Path) -> tuple[str, ...]:
+    """The sensors that the file holds."""
+    return tuple(_names(_root(path)))
+
+
+def _root(path: Path) -> ElementTree.Element:
+    try:
+        return safe_xml.parse(path)
+    except safe_xml.XmlError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def _names(root: ElementTree.Element) -> list[str]:
+    return [element.get("label", "") for element in root.iterfind(".//{*}sensors/{*}sensor")]
+
+
+def _times_s(root: ElementTree.Element, frames: list[ElementTree.Element]) -> np.ndarray:
+    """Frame index over the frame rate; `time` is rounded to milliseconds."""
+    subject = root.find("{*}subject")
+    rate = number(subject.get("frameRate", "")) if subject is not None else float("nan")
+    index = [frame.get("index") for frame in frames]
+    if rate > 0 and all(text is not None for text in index):
+        return np.array([number(text or "") for text in index]) / rate
+    return np.array([number(frame.get("time", "")) for frame in frames]) / 1000.0
+
+
+def _vectors(frames: list[ElementTree.Element], tag: str, sensor: int, size: int) -> np.ndarray:
+    """(frames, size) of one sensor; NaN where the element is missing or cut short."""
+    result = np.full((len(frames), size), np.nan)
+    for row, frame in zip(result, frames, strict=True):
+        words = (frame.findtext(f"{{*}}{tag}") or "").split()[sensor * size : (sensor + 1) * size]
+        if len(words) == size:
+            row[:] = [number(word) for word in words]
+    return result

@@ -1,0 +1,123 @@
+"""What every IMU format is brought to: sorted, unit quaternions, specific force.
+
+Files lose packets, repeat them, write them late, and write NaN; `tidy` removes what cannot be used
+and says what it did. An accelerometer measures specific force: at rest it reads +9.8 along up.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from fusecap.errors import InputError
+
+GRAVITY_M_S2 = 9.80665
+_UNIT_TOLERANCE = 0.01
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SharedClock:
+    """The recorder's clock, common to sensors that were recorded together."""
+
+    start_s: float
+    """Its reading at the track's time 0."""
+    period_s: float
+    """It starts over at zero after this long."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImuTrack:
+    """The samples of one sensor."""
+
+    times_s: np.ndarray
+    """(N,) strictly ascending, on the file's clock."""
+    orientation_wxyz: np.ndarray
+    """(N, 4) imu_world_from_imu, unit."""
+    accel_m_s2: np.ndarray
+    """(N, 3) specific force in the imu frame; NaN where not measured."""
+    notes: tuple[str, ...] = ()
+    """What was wrong with the file and has been dealt with."""
+    clock: SharedClock | None = None
+
+    @property
+    def rate_hz(self) -> float:
+        """From the median spacing; NaN for a single sample."""
+        if len(self.times_s) < 2:
+            return float("nan")
+        return float(1.0 / np.median(np.diff(self.times_s)))
+
+
+def tidy(
+    where: str,
+    times_s: np.ndarray,
+    orientation_wxyz: np.ndarray,
+    accel_m_s2: np.ndarray,
+    *,
+    clock: SharedClock | None = None,
+    notes: tuple[str, ...] = (),
+) -> ImuTrack:
+    """A track from raw columns; raises `InputError` when no sample is left.
+
+    Rows without a time or an orientation are dropped, non-finite accelerations become NaN, rows
+    are sorted by time, of equal times the first is kept, quaternions are normalised.
+    """
+    said = list(notes)
+    norm = np.linalg.norm(orientation_wxyz, axis=1)
+    whole = np.isfinite(times_s) & np.isfinite(norm)
+    usable = whole & (norm > 0.1)
+    _note(said, ~whole, "{} rows without time or orientation dropped")
+    _note(said, whole & ~usable, "{} zero quaternions dropped")
+    if not usable.any():
+        raise InputError(f"{where}: no sample with an orientation; expected at least one")
+    times_s, quaternion, accel = times_s[usable], orientation_wxyz[usable], accel_m_s2[usable]
+    norm = norm[usable]
+    _note(said, np.abs(norm - 1) > _UNIT_TOLERANCE, "{} quaternions were not unit")
+    _note(said, np.diff(times_s) < 0, "{} samples out of order, sorted")
+    order = np.argsort(times_s, kind="stable")
+    times_s, quaternion, accel = times_s[order], (quaternion / norm[:, None])[order], accel[order]
+    fresh = np.concatenate([[True], np.diff(times_s) > 0])
+    _note(said, ~fresh, "{} duplicate timestamps dropped")
+    times_s, quaternion, accel = times_s[fresh], quaternion[fresh], accel[fresh]
+    if len(times_s) > 2:
+        step = np.diff(times_s)
+        lost = np.round(step / np.median(step)).astype(int) - 1
+        gaps = np.count_nonzero(lost > 0)
+        if gaps:
+            said.append(f"{lost[lost > 0].sum()} samples lost in {gaps} gaps")
+    measured = np.all(np.isfinite(accel), axis=1, keepdims=True)
+    return ImuTrack(
+        times_s=times_s,
+        orientation_wxyz=quaternion,
+        accel_m_s2=np.where(measured, accel, np.nan),
+        notes=tuple(said),
+        clock=clock,
+    )
+
+
+def _note(said: list[str], affected: np.ndarray, text: str) -> None:
+    if affected.any():
+        said.append(text.format(np.count_nonzero(affected)))
+
+
+def specific_force(
+    orientation_wxyz: np.ndarray, free_accel_in_imu_world_m_s2: np.ndarray
+) -> np.ndarray:
+    """What the accelerometer read, from acceleration without gravity in a z-up imu world."""
+    result = np.full_like(free_accel_in_imu_world_m_s2, np.nan)
+    norm = np.linalg.norm(orientation_wxyz, axis=1)
+    usable = np.isfinite(norm) & (norm > 0.1)
+    if usable.any():
+        imu_world_from_imu = Rotation.from_quat(orientation_wxyz[usable][:, [1, 2, 3, 0]])
+        with_gravity = free_accel_in_imu_world_m_s2[usable] + [0.0, 0.0, GRAVITY_M_S2]
+        result[usable] = imu_world_from_imu.inv().apply(with_gravity)
+    return result
+
+
+def unwrapped(counter: np.ndarray, modulus: int) -> np.ndarray:
+    """A wrapping counter made monotonic; a step back by less than half the range stays one."""
+    if len(counter) == 0:
+        return counter.astype(np.float64)
+    step = np.mod(np.diff(counter) + modulus / 2, modulus) - modulus / 2
+    return np.concatenate([[0.0], np.cumsum(step)]) + counter[0]

@@ -1,0 +1,83 @@
+"""Xsens MT Manager text exports (MTw, MTi): `//` lines, then tab- or comma-separated columns.
+
+Orientation is imu_world (z up) from imu, as one of
+    Quat_q0..q3                w, x, y, z
+    Mat[1][1]..Mat[3][3]       Mat[row][column], listed column by column
+    Roll, Pitch, Yaw           degrees; Rz(yaw) Ry(pitch) Rx(roll)
+`Acc_X..Z` is specific force in the imu frame. Time is `PacketCounter` (16 bits, common to the
+sensors of one recording) over the update rate.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from fusecap.errors import InputError
+from fusecap.sources.imu_files.table import Table, read_table
+from fusecap.sources.imu_files.track import ImuTrack, SharedClock, tidy, unwrapped
+
+PACKET_MODULUS = 65536
+_QUATERNION = [f"Quat_q{i}" for i in range(4)]
+_MATRIX = [f"Mat[{row}][{column}]" for row in (1, 2, 3) for column in (1, 2, 3)]
+_EULER_XYZ = ["Roll", "Pitch", "Yaw"]
+_RATE = re.compile(r"Update Rate:\s*([\d.]+)", re.IGNORECASE)
+
+
+def read(path: Path, rate_hz: float | None) -> ImuTrack:
+    """The samples, starting at time 0; `rate_hz` is needed where the header does not say it."""
+    table = read_table(path, "PacketCounter")
+    rate = _rate_hz(table, rate_hz)
+    counter = table.take(["PacketCounter"])[:, 0]
+    counted = np.isfinite(counter)
+    packets = np.full(len(counter), np.nan)
+    packets[counted] = unwrapped(counter[counted], PACKET_MODULUS)
+    if not counted.any():
+        raise InputError(f"{path}: PacketCounter is empty; export it, it is the time of a sample")
+    first = float(np.nanmin(packets))
+    return tidy(
+        str(path),
+        (packets - first) / rate,
+        _orientation_wxyz(table),
+        table.take_or_nan(["Acc_X", "Acc_Y", "Acc_Z"]),
+        clock=SharedClock(start_s=first / rate, period_s=PACKET_MODULUS / rate),
+    )
+
+
+def _rate_hz(table: Table, stated_hz: float | None) -> float:
+    for line in table.preamble:
+        match = _RATE.search(line)
+        if match and float(match.group(1)) > 0:
+            return float(match.group(1))
+    if stated_hz is None:
+        raise InputError(
+            f"{table.path}: the header states no update rate; give rate_hz of this imu"
+        )
+    return stated_hz
+
+
+def _orientation_wxyz(table: Table) -> np.ndarray:
+    if table.has(_QUATERNION):
+        return table.take(_QUATERNION)
+    if table.has(_MATRIX):
+        numbers = table.take(_MATRIX).reshape(-1, 3, 3)
+        usable = np.nan_to_num(np.linalg.det(numbers)) > 0.1
+        rotation = Rotation.from_matrix(numbers[usable]) if usable.any() else None
+    elif table.has(_EULER_XYZ):
+        numbers = table.take(_EULER_XYZ)
+        usable = np.all(np.isfinite(numbers), axis=1)
+        rotation = (
+            Rotation.from_euler("xyz", numbers[usable], degrees=True) if usable.any() else None
+        )
+    else:
+        raise InputError(
+            f"{table.path}: no orientation; export quaternions (Quat_q0..3), the rotation matrix "
+            "(Mat[1][1]..) or Euler angles (Roll, Pitch, Yaw) from MT Manager"
+        )
+    result = np.full((len(numbers), 4), np.nan)
+    if rotation is not None:
+        result[usable] = rotation.as_quat()[:, [3, 0, 1, 2]]
+    return result

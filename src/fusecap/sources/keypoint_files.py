@@ -1,0 +1,162 @@
+"""OpenPose JSON: one folder per camera, one file per frame.
+
+    {"people": [{"pose_keypoints_2d": [x, y, confidence, ...]}, ...]}
+
+The last number of a file's name is its frame. A frame without a file holds nobody. A keypoint at
+(0, 0) or with confidence 0 is missing: NaN, NaN, 0 from here on.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fusecap.body.landmarks import LANDMARK_SETS, LandmarkSet
+from fusecap.errors import InputError
+
+Progress = Callable[[int, int], None]
+"""Called with (done, total)."""
+
+_FRAME_NUMBER = re.compile(r"(\d+)(?:_keypoints)?$")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KeypointTrack:
+    """Everyone that one camera's detector found."""
+
+    name: str
+    landmarks: LandmarkSet
+    rate_hz: float
+    frames: np.ndarray
+    """(F,) frame numbers, ascending; a missing number is a frame without people."""
+    times_s: np.ndarray
+    """(F,) on the session's clock: frame / rate + offset."""
+    people: tuple[np.ndarray, ...]
+    """Per frame (n, K, 3): x [px], y [px], confidence 0-1; NaN, NaN, 0 where missing."""
+    broken: tuple[str, ...]
+    """Names of unreadable files, taken as frames without people."""
+
+
+class _BrokenFile(Exception):
+    """Truncated or garbled JSON."""
+
+
+def read_keypoints(
+    folder: Path,
+    *,
+    name: str,
+    landmarks: LandmarkSet,
+    rate_hz: float,
+    offset_s: float = 0.0,
+    progress: Progress | None = None,
+) -> KeypointTrack:
+    """All frames of one camera.
+
+    Raises `InputError` for a folder without frames, one whose files are all broken, and keypoints
+    of another format; a broken file among good ones counts as a frame without people.
+    """
+    numbered = _numbered_files(folder)
+    people: list[np.ndarray] = []
+    broken: list[str] = []
+    for done, (_, path) in enumerate(numbered, start=1):
+        try:
+            people.append(_read_frame(path, landmarks))
+        except _BrokenFile:
+            people.append(np.empty((0, len(landmarks.landmark_names), 3)))
+            broken.append(os.path.basename(path))
+        if progress is not None:
+            progress(done, len(numbered))
+    if len(broken) == len(numbered):
+        raise InputError(
+            f"{folder}: none of the {len(numbered)} keypoint files can be read "
+            f"(first: {broken[0]}); expected OpenPose JSON: run the detector again"
+        )
+    frames = np.array([number for number, _ in numbered], dtype=np.int64)
+    return KeypointTrack(
+        name=name,
+        landmarks=landmarks,
+        rate_hz=rate_hz,
+        frames=frames,
+        times_s=frames / rate_hz + offset_s,
+        people=tuple(people),
+        broken=tuple(broken),
+    )
+
+
+def _numbered_files(folder: Path) -> list[tuple[int, str]]:
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder; expected one keypoint JSON per frame")
+    by_frame: dict[int, str] = {}
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            stem, suffix = os.path.splitext(entry.name)
+            match = _FRAME_NUMBER.search(stem) if suffix == ".json" else None
+            if match is None:
+                continue
+            number = int(match.group(1))
+            if number in by_frame:
+                pair = sorted((os.path.basename(by_frame[number]), entry.name))
+                raise InputError(
+                    f"{folder}: {pair[0]} and {pair[1]} are both frame {number}; "
+                    "expected one folder per camera"
+                )
+            by_frame[number] = entry.path
+    if not by_frame:
+        raise InputError(
+            f"{folder}: no keypoint files; expected one .json per frame whose name ends in the "
+            "frame's number"
+        )
+    return sorted(by_frame.items())
+
+
+def _read_frame(path: str, landmarks: LandmarkSet) -> np.ndarray:
+    count = len(landmarks.landmark_names)
+    try:
+        with open(path, "rb") as file:
+            entries = json.load(file)["people"]
+        flat = [entry["pose_keypoints_2d"] for entry in entries]
+    except (ValueError, KeyError, TypeError, OSError, RecursionError):
+        raise _BrokenFile from None
+    flat = [values for values in flat if values]
+    for values in flat:
+        if not isinstance(values, list):
+            raise _BrokenFile
+        if len(values) != 3 * count:
+            raise _wrong_count(path, landmarks, values)
+    try:
+        people = np.array(flat, dtype=np.float64).reshape(len(flat), count, 3)
+    except (ValueError, TypeError):
+        raise _BrokenFile from None
+    return without_missing(people)
+
+
+def without_missing(people: np.ndarray) -> np.ndarray:
+    """(n, K, 3) with missing keypoints as NaN, NaN, 0; people without any keypoint are left out."""
+    if len(people) == 0:
+        return people
+    seen = np.all(np.isfinite(people), axis=2) & (people[:, :, 2] > 0)
+    seen &= np.any(people[:, :, :2] != 0, axis=2)
+    people = np.where(seen[:, :, None], people, [np.nan, np.nan, 0.0])
+    people[:, :, 2] = np.minimum(people[:, :, 2], 1.0)
+    return people[seen.any(axis=1)]
+
+
+def _wrong_count(path: str, landmarks: LandmarkSet, values: list[Any]) -> InputError:
+    found = len(values) / 3
+    alike = [
+        f"'openpose-{other.name}'"
+        for other in LANDMARK_SETS.values()
+        if len(other.landmark_names) == found
+    ]
+    advice = f"it looks like {' or '.join(alike)}: set format" if alike else "check the detector"
+    return InputError(
+        f"{path}: a person has {found:g} keypoints, expected the "
+        f"{len(landmarks.landmark_names)} of 'openpose-{landmarks.name}'; {advice}"
+    )

@@ -1,0 +1,161 @@
+"""Whether cameras agree with each other, judged by the people they see.
+
+A keypoint in one view confines the same keypoint in another to a line. How far it lies from that
+line, the median over people and keypoints, is what two calibrated, synchronised cameras disagree
+by: a few pixels of detector noise when all is well. Nobody needs to be identified: in every pair
+of views the people are assigned to each other so that the total distance is least.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from fusecap.body.landmarks import LandmarkSet
+from fusecap.geometry.camera import Camera, Rig
+from fusecap.sources.keypoint_files import KeypointTrack
+from fusecap.sources.synchronizer import people_at
+
+MIN_CONFIDENCE = 0.3
+MIN_SHARED_KEYPOINTS = 6
+
+
+def pair_distances_px(
+    first: Camera, second: Camera, people_a: np.ndarray, people_b: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Indices into both views' people, and each pair's median distance to the epipolar lines [px].
+
+    Pairs that share fewer than `MIN_SHARED_KEYPOINTS` keypoints are left out.
+    """
+    none = np.empty(0, dtype=np.int64)
+    if len(people_a) == 0 or len(people_b) == 0:
+        return none, none, np.empty(0)
+    a, b = _rays(first, people_a), _rays(second, people_b)
+    b_from_a = second.rotation @ first.rotation.T
+    x, y, z = second.translation - b_from_a @ first.translation
+    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ b_from_a
+    lines_in_b, lines_in_a = a @ essential.T, b @ essential
+    with np.errstate(divide="ignore", invalid="ignore"):
+        product = np.abs(np.einsum("nki,mki->nmk", lines_in_b, b))
+        in_b = product / np.linalg.norm(lines_in_b[:, :, :2], axis=2)[:, None] * second.matrix[0, 0]
+        in_a = product / np.linalg.norm(lines_in_a[:, :, :2], axis=2)[None] * first.matrix[0, 0]
+    distance = (in_a + in_b) / 2
+    enough = np.isfinite(distance).sum(2) >= MIN_SHARED_KEYPOINTS
+    cost = np.full(distance.shape[:2], 1e6)
+    cost[enough] = np.nanmedian(distance[enough], axis=1)
+    rows, columns = linear_sum_assignment(cost)
+    kept = enough[rows, columns]
+    rows, columns = rows[kept], columns[kept]
+    return rows, columns, cost[rows, columns]
+
+
+def _rays(camera: Camera, people: np.ndarray) -> np.ndarray:
+    """(n, K, 3) points at depth 1 in the camera; NaN where not seen well."""
+    flat = camera.undistort(people[:, :, :2].reshape(-1, 2)).reshape(*people.shape[:2], 2)
+    flat = np.where(people[:, :, 2:] >= MIN_CONFIDENCE, flat, np.nan)
+    return np.concatenate([flat, np.ones((*flat.shape[:2], 1))], axis=2)
+
+
+def disagreement_px(rig: Rig, tracks: Sequence[KeypointTrack], times_s: np.ndarray) -> np.ndarray:
+    """(C, C) median disagreement of every pair of cameras; NaN where nobody is seen by both."""
+    views = [[people_at(track, t) for t in times_s] for track in tracks]
+    result = np.full((len(tracks), len(tracks)), np.nan)
+    for i in range(len(tracks)):
+        for j in range(i + 1, len(tracks)):
+            result[i, j] = result[j, i] = _median_px(
+                rig.cameras[i], rig.cameras[j], views[i], views[j]
+            )
+    return result
+
+
+def _median_px(
+    first: Camera, second: Camera, people_a: list[np.ndarray], people_b: list[np.ndarray]
+) -> float:
+    pairs = zip(people_a, people_b, strict=True)
+    distances = np.concatenate([pair_distances_px(first, second, a, b)[2] for a, b in pairs])
+    return float(np.median(distances)) if len(distances) else float("nan")
+
+
+def per_camera_px(disagreement: np.ndarray) -> np.ndarray:
+    """(C,) each camera's disagreement with the typical other one.
+
+    The lower median over the others, so that one bad camera does not spoil the good ones.
+    """
+    result = np.full(len(disagreement), np.nan)
+    for camera, row in enumerate(disagreement):
+        known = np.sort(row[np.isfinite(row)])
+        if len(known):
+            result[camera] = known[(len(known) - 1) // 2]
+    return result
+
+
+def best_shift_s(
+    rig: Rig,
+    tracks: Sequence[KeypointTrack],
+    camera: int,
+    times_s: np.ndarray,
+    shifts_s: np.ndarray,
+) -> tuple[float, float]:
+    """The delay to add to one camera's clock that makes it agree best, and what is left [px]."""
+    others = [other for other in range(len(tracks)) if other != camera]
+    views = {other: [people_at(tracks[other], t) for t in times_s] for other in others}
+    left = np.full(len(shifts_s), np.inf)
+    for index, shift_s in enumerate(shifts_s):
+        own = [people_at(tracks[camera], t - shift_s) for t in times_s]
+        medians = np.array(
+            [_median_px(rig.cameras[camera], rig.cameras[o], own, views[o]) for o in others]
+        )
+        if np.isfinite(medians).any():
+            left[index] = np.nanmin(medians) if len(others) < 3 else np.nanmedian(medians)
+    best = int(np.argmin(left))
+    return float(shifts_s[best]), float(left[best])
+
+
+def standing_people(
+    rig: Rig, tracks: Sequence[KeypointTrack], landmarks: LandmarkSet, times_s: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Heads and ankle centres (n, 3) in the world [m], triangulated from pairs of views."""
+    top = next(
+        (i for name in ("nose", "head_top", "neck") if (i := landmarks.index(name)) is not None),
+        None,
+    )
+    ankles = [landmarks.index(f"{side}_ankle") for side in ("left", "right")]
+    heads, feet = [np.empty((0, 3))], [np.empty((0, 3))]
+    if top is None or None in ankles:
+        return heads[0], feet[0]
+    wanted = [top, *(ankle for ankle in ankles if ankle is not None)]
+    for i, first in enumerate(rig.cameras):
+        for j, second in enumerate(rig.cameras[i + 1 :], start=i + 1):
+            for t_s in times_s:
+                a, b = people_at(tracks[i], t_s), people_at(tracks[j], t_s)
+                rows, columns, cost = pair_distances_px(first, second, a, b)
+                good = cost < 0.01 * np.hypot(*first.size_px)
+                points = _triangulated(
+                    first, second, a[rows[good]][:, wanted], b[columns[good]][:, wanted]
+                )
+                heads.append(points[:, 0])
+                feet.append(points[:, 1:].mean(1))
+    head, foot = np.concatenate(heads), np.concatenate(feet)
+    whole = np.isfinite(head + foot).all(axis=1)
+    return head[whole], foot[whole]
+
+
+def _triangulated(
+    first: Camera, second: Camera, people_a: np.ndarray, people_b: np.ndarray
+) -> np.ndarray:
+    """(n, k, 3): midpoints of the shortest link between two rays; NaN for nearly parallel ones."""
+    u = _rays(first, people_a) @ first.rotation
+    v = _rays(second, people_b) @ second.rotation
+    u /= np.linalg.norm(u, axis=2, keepdims=True)
+    v /= np.linalg.norm(v, axis=2, keepdims=True)
+    base = second.position_in_world - first.position_in_world
+    cosine = np.sum(u * v, axis=2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = 1.0 / np.where(np.abs(cosine) < 0.99, 1 - cosine**2, np.nan)
+        along_u = (u @ base - cosine * (v @ base)) * scale
+        along_v = (cosine * (u @ base) - v @ base) * scale
+        near_u = first.position_in_world + along_u[:, :, None] * u
+        near_v = second.position_in_world + along_v[:, :, None] * v
+    return (near_u + near_v) / 2
