@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
-from session_files import edit, imu_csv, write_session
 
 from fusecap.errors import InputError, SessionError
 from fusecap.sources.session import load_session, parse_session
 from fusecap.sources.session_data import open_session
+from session_files import edit, imu_csv, write_session
 
 CAMERA = '[session]\nname = "a"\ncalibration = "c.toml"\n[[camera]]\nname = "left"\nkeypoints="k"\n'
 

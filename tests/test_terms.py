@@ -14,6 +14,7 @@ from fusecap.solve.pose_solver import ImuSites, Measurements, PoseSolver
 from paper_twin import Twin
 from scenes import IMU13, flat_prior, measure, random_pose, ring
 
+ALL_TERMS = SolverOptions(weights=Weights.paper())
 TERMS = ("position", "orientation", "acceleration", "projection", "deviation", "floor")
 LANDMARKS = LANDMARK_SETS["body25"]
 
@@ -83,7 +84,7 @@ def test_term_agrees_with_its_twin(term, rng):
 
 
 def test_all_terms_together_agree_with_the_twin(rng):
-    solver, twin, theta, data = scene(rng, SolverOptions())
+    solver, twin, theta, data = scene(rng, ALL_TERMS)
     assert_agrees(solver, twin, theta, data)
 
 
@@ -95,13 +96,13 @@ def test_position_term_agrees_under_lens_distortion(rng):
 
 
 def test_extended_skeleton_agrees_with_the_twin(rng):
-    solver, twin, theta, data = scene(rng, SolverOptions(), skeleton=EXTENDED23)
+    solver, twin, theta, data = scene(rng, ALL_TERMS, skeleton=EXTENDED23)
     assert_agrees(solver, twin, theta, data)
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-9, 1e-5])
 def test_derivatives_hold_near_the_zero_pose(size, rng):
-    solver, twin, _, data = scene(rng, SolverOptions(), angle=size)
+    solver, twin, _, data = scene(rng, ALL_TERMS, angle=size)
     theta = random_pose(rng, size)
     assert_agrees(solver, twin, theta, data)
 
@@ -124,7 +125,7 @@ def test_orientation_gradient_is_right_up_to_half_a_turn(degrees, rng):
 
 
 def test_derivatives_hold_with_a_root_turned_by_almost_a_full_turn(rng):
-    solver, twin, theta, data = scene(rng, SolverOptions())
+    solver, twin, theta, data = scene(rng, ALL_TERMS)
     theta[3:6] = np.array([0.1, 0.99, 0.05]) * 6.0
     assert_agrees(solver, twin, theta, data)
 
@@ -145,7 +146,7 @@ def test_point_behind_camera_has_no_gradient_but_costs_as_an_outlier(rng):
 
 
 def test_missing_data_neither_costs_nor_pulls(rng):
-    solver, twin, theta, data = scene(rng, SolverOptions())
+    solver, twin, theta, data = scene(rng, ALL_TERMS)
     keypoints = data.keypoints.copy()
     keypoints[0, ::2] = [np.nan, np.nan, 0.0]
     keypoints[1, ::3] = [np.nan, np.nan, 0.7]

@@ -49,11 +49,7 @@ class Anatomy:
     def __init__(self, landmark_set: LandmarkSet) -> None:
         names = landmark_set.landmark_names
         self._limbs = np.array(
-            [
-                (names.index(a), names.index(b))
-                for a, b in _RIGID_PAIRS
-                if a in names and b in names
-            ]
+            [(names.index(a), names.index(b)) for a, b in _RIGID_PAIRS if a in names and b in names]
         )
         self._torso = np.array([names.index(name) for name in _TORSO if name in names])
         self._landmark_set = landmark_set

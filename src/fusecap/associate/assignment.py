@@ -9,6 +9,7 @@ from scipy.optimize import linear_sum_assignment
 def assign_each_view(
     distance_m: np.ndarray,
     gate_m: np.ndarray,
+    camera_of: np.ndarray,
     first: tuple[int, ...],
     free: np.ndarray,
     person: np.ndarray,
@@ -18,15 +19,20 @@ def assign_each_view(
     `distance_m` is (t, n), `free` (n,) loses the detections given away. A pair beyond the gate
     costs as much as the gate, so leaving a track without a detection is never dearer than that.
     """
-    inside = (distance_m < gate_m[:, None]) & free
-    for c in range(len(first) - 1):
-        view = slice(first[c], first[c + 1])
-        near = inside[:, view] & (person[:, c] < 0)[:, None]
-        if not near.any():
-            continue
-        cost = np.where(near, distance_m[:, view], gate_m[:, None])
-        tracks, people = linear_sum_assignment(cost)
+    near = (distance_m < gate_m[:, None]) & free & (person < 0)[:, camera_of]
+    # A pair that nobody else is near to needs no search.
+    in_view = near @ np.equal.outer(camera_of, np.arange(person.shape[1])).astype(np.float64)
+    alone = near & (near.sum(axis=0) == 1) & (in_view[:, camera_of] == 1)
+    tracks, people = np.nonzero(alone)
+    person[tracks, camera_of[people]] = people
+    free[people] = False
+    near ^= alone
+    if not near.any():
+        return
+    cost = np.where(near, distance_m, gate_m[:, None])
+    for c in np.flatnonzero(np.bincount(camera_of[near.any(axis=0)])):
+        tracks, people = linear_sum_assignment(cost[:, first[c] : first[c + 1]])
+        people += first[c]
         chosen = near[tracks, people]
-        tracks, people = tracks[chosen], people[chosen] + first[c]
-        person[tracks, c] = people
-        free[people] = False
+        person[tracks[chosen], c] = people[chosen]
+        free[people[chosen]] = False

@@ -68,8 +68,8 @@ def find_candidates(
     if len(pairs) == 0:
         return []
 
-    distance, _ = views.distances(points, mirror, 2 * options.support_m)
-    support = np.where(free, np.clip(1 - distance / options.support_m, 0, None), 0)
+    distance, _ = views.distances(points, mirror, 2 * options.support_m, free)
+    support = np.clip(1 - distance / options.support_m, 0, None)
     filled = [c for c in range(len(views.first) - 1) if views.first[c] < views.first[c + 1]]
     starts = [views.first[c] for c in filled]
     alive = np.ones(len(pairs), dtype=bool)

@@ -57,16 +57,16 @@ class _Gathered:
 
     sources: list[tuple[int, int]] = field(default_factory=list)
     total: np.ndarray | float = 0.0
-    count: np.ndarray | int = 0
+    known: np.ndarray | int = 0
 
     def append(self, a: int, b: int, points: np.ndarray) -> None:
         known = np.isfinite(points[:, :1])
         self.sources.append((a, b))
         self.total = self.total + np.where(known, points, 0.0)
-        self.count = self.count + known
+        self.known = self.known + known
 
     def mean(self) -> np.ndarray:
-        return self.total / np.where(self.count, self.count, np.nan)
+        return self.total / np.where(self.known, self.known, np.nan)
 
     def person(self, camera_of: np.ndarray, cameras: int) -> np.ndarray:
         """Per camera the row listed most often, the first of equals; -1 for none."""
@@ -74,7 +74,7 @@ class _Gathered:
         person = np.full(cameras, -1)
         for row in reversed(list(dict.fromkeys(rows))):
             c = camera_of[row]
-            if person[c] < 0 or rows.count(row) >= rows.count(person[c]):
+            if person[c] < 0 or rows.count(row) >= rows.count(int(person[c])):
                 person[c] = row
         return person
 

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
+
+from fusecap.kernels import association as kernels
 
 POSITION_GAIN = 0.8
 """Share of a triangulated landmark's news that is believed; the rest is detector noise."""
@@ -42,11 +46,10 @@ class Track:
         """Updates in which at least two views agreed."""
         self.strong_frames = 0
         """Those of them in which enough views for a birth did."""
-        self.limb_sum_m = np.zeros(limb_lengths_m.shape)
-        self.limb_count = np.zeros(limb_lengths_m.shape)
+        self.limb_count = np.isfinite(limb_lengths_m).astype(np.float64)
+        self.limb_sum_m = np.nan_to_num(limb_lengths_m)
         self.overlap_since_ns: int | None = None
         """Since when it has shared its place with another track."""
-        self.measure(limb_lengths_m)
 
     def predict(self, now_ns: int, solved: np.ndarray | None) -> np.ndarray:
         """Landmarks [m] now: the solver's where it gives them, else extrapolated."""
@@ -54,36 +57,37 @@ class Track:
         own = self.landmarks + self.velocity * ahead_s
         return own if solved is None else np.where(np.isnan(solved), own, solved)
 
-    def absorb(self, measured: np.ndarray, predicted: np.ndarray, now_ns: int) -> None:
-        """Move to what was measured (k, 3); landmarks without news go along with the body."""
-        news = measured - predicted
-        fresh = np.isfinite(news[:, 0])
-        step = np.where(fresh[:, None], POSITION_GAIN * news, 0.0)
-        if fresh.any():
-            step[~fresh] = POSITION_GAIN * np.median(news[fresh], axis=0)
-        moved = predicted + step
-        moved = np.where(np.isnan(moved), measured, moved)
-        dt_s = (now_ns - self.time_ns) * 1e-9
-        if dt_s > 0:
-            velocity = (moved - self.landmarks) / dt_s
-            velocity = (1 - VELOCITY_GAIN) * self.velocity + VELOCITY_GAIN * velocity
-            self.velocity = np.where(np.isfinite(velocity), velocity, self.velocity)
-        self.landmarks = moved
-        self.time_ns = self.seen_ns = now_ns
-
     def restart(self, measured: np.ndarray, now_ns: int) -> None:
         """Begin anew where the person was found again."""
         self.landmarks = measured
         self.velocity = np.zeros(measured.shape)
         self.time_ns = self.seen_ns = self.triangulated_ns = now_ns
 
-    def measure(self, limb_lengths_m: np.ndarray) -> None:
-        """Take limb lengths [m] (m,) into the mean; NaN where not seen."""
-        known = np.isfinite(limb_lengths_m)
-        self.limb_sum_m[known] += limb_lengths_m[known]
-        self.limb_count += known
-
     def limb_lengths_m(self) -> np.ndarray:
         """Mean limb lengths [m] (m,); NaN where never seen."""
         count = np.where(self.limb_count > 0, self.limb_count, np.nan)
         return self.limb_sum_m / count
+
+
+def measure(tracks: Sequence[Track], limb_lengths_m: np.ndarray) -> None:
+    """Take limb lengths [m] (t, m) into the means; NaN where not seen."""
+    known = np.isfinite(limb_lengths_m)
+    lengths = np.where(known, limb_lengths_m, 0.0)
+    for t, track in enumerate(tracks):
+        track.limb_sum_m += lengths[t]
+        track.limb_count += known[t]
+
+
+def absorb(
+    tracks: Sequence[Track], measured: np.ndarray, predicted: np.ndarray, now_ns: int
+) -> None:
+    """Move tracks to what was measured (t, k, 3); landmarks without news go along with the body."""
+    landmarks = np.array([track.landmarks for track in tracks])
+    velocity = np.array([track.velocity for track in tracks])
+    dt_s = np.array([(now_ns - track.time_ns) * 1e-9 for track in tracks])
+    kernels.move_tracks(
+        measured, predicted, dt_s, POSITION_GAIN, VELOCITY_GAIN, landmarks, velocity
+    )
+    for t, track in enumerate(tracks):
+        track.landmarks, track.velocity = landmarks[t], velocity[t]
+        track.time_ns = track.seen_ns = now_ns

@@ -33,7 +33,7 @@ from fusecap.associate.anatomy import MIN_LIMBS, Anatomy
 from fusecap.associate.assignment import assign_each_view
 from fusecap.associate.candidates import Candidate, CandidateOptions, find_candidates
 from fusecap.associate.subjects import Subject, check_distinct
-from fusecap.associate.track import Track
+from fusecap.associate.track import Track, absorb, measure
 from fusecap.associate.views import MIN_COMMON, Views
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.errors import SessionError
@@ -185,28 +185,31 @@ class Tracker:
         if len(expected) == 0:
             return person, expected.copy()
         gate = np.full(len(expected), o.gate_m)
-        distance = self._distance(views, expected, 2 * o.gate_m)
+        distance = self._distance(views, expected, free)
         young = self._young()
-        assign_each_view(distance, np.where(young, 0.0, gate), views.first, free, person)
+        assign_each_view(
+            distance, np.where(young, 0.0, gate), views.camera_of, views.first, free, person
+        )
         if young.any():
-            assign_each_view(distance, gate, views.first, free, person)
+            assign_each_view(distance, gate, views.camera_of, views.first, free, person)
         measured = self._check(views, person, distance, free)
 
         if free.any():
             current = np.where(np.isnan(measured), expected, measured)
-            distance = self._distance(views, current, 2 * o.gate_m)
+            again = self._distance(views, current, free)
             tight = np.full(len(current), o.candidates.consistency_m)
             before = person.copy()
-            assign_each_view(distance, tight, views.first, free, person)
+            assign_each_view(again, tight, views.camera_of, views.first, free, person)
             if (person != before).any():
-                measured = self._check(views, person, distance, free)
-            # A second detection of somebody whom this view already shows is nobody.
-            taken = (person >= 0)[:, views.camera_of]
-            free &= ~((distance < o.candidates.consistency_m) & taken).any(axis=0)
+                measured = self._check(views, person, np.fmin(again, distance), free)
+            # What looks like somebody already found, doubled or mirrored, is nobody else.
+            free &= ~(again < o.candidates.consistency_m).any(axis=0)
         return person, measured
 
-    def _distance(self, views: Views, landmarks: np.ndarray, truncation_m: float) -> np.ndarray:
-        direct, mirrored = views.distances(landmarks, self._mirror, truncation_m)
+    def _distance(self, views: Views, landmarks: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+        """Distance [m] (t, n) of tracks to detections, right way round or mirrored."""
+        truncation_m = 2 * self._options.gate_m
+        direct, mirrored = views.distances(landmarks, self._mirror, truncation_m, wanted)
         return np.minimum(direct, mirrored + self._options.mirror_penalty_m)
 
     def _check(
@@ -232,23 +235,23 @@ class Tracker:
         """Move the tracks on which two views or more agree."""
         count = (person >= 0).sum(axis=1)
         agreed = np.isfinite(measured[:, :, 0]).sum(axis=1) >= MIN_COMMON
-        limbs = self._anatomy.limb_lengths(measured)
-        for t in np.flatnonzero(agreed):
-            track = self._tracks[t]
-            track.absorb(measured[t], expected[t], now_ns)
-            track.measure(limbs[t])
-            self._count_frame(track, int(count[t]), now_ns)
+        moving = [self._tracks[t] for t in np.flatnonzero(agreed)]
+        if not moving:
+            return
+        absorb(moving, measured[agreed], expected[agreed], now_ns)
+        measure(moving, self._anatomy.limb_lengths(measured[agreed]))
+        for track, views in zip(moving, count[agreed], strict=True):
+            self._count_frame(track, int(views), now_ns)
 
-    def _follow(
-        self, views: Views, person: np.ndarray, expected: np.ndarray, now_ns: int
-    ) -> None:
+    def _follow(self, views: Views, person: np.ndarray, expected: np.ndarray, now_ns: int) -> None:
         """Move the tracks that hardly more than one view shows: sideways, at the depth they had."""
         for t in range(len(expected)):
             track = self._tracks[t]
             if track.seen_ns < now_ns and (person[t] >= 0).any():
                 camera = int(np.argmax(person[t] >= 0))
                 ray = views.rays[person[t, camera]]
-                track.absorb(self._at_depth(camera, ray, track.landmarks), expected[t], now_ns)
+                seen = self._at_depth(camera, ray, track.landmarks)
+                absorb([track], seen[None], expected[t : t + 1], now_ns)
 
     def _count_frame(self, track: Track, views: int, now_ns: int) -> None:
         track.triangulated_ns = now_ns
@@ -292,6 +295,8 @@ class Tracker:
         o = self._options
         alone = person[(person >= 0).sum(axis=1) == 1].max(axis=1)
         free[alone] = True
+        if len(np.unique(views.camera_of[free])) < 2:
+            return person, measured
         found = find_candidates(views, free, self._anatomy, self._mirror, o.candidates)
         if not found:
             return person, measured
@@ -398,27 +403,23 @@ class Tracker:
 
     def _doubled(self, alive: list[Track], measured: np.ndarray, now_ns: int) -> list[Track]:
         """Tracks that have shared the place of a better established one for too long."""
-        o = self._options
         subjects = self._subjects()
-        row = {id(track): r for r, track in enumerate(self._tracks)}
-        seen = [track for track in alive if track.triangulated_ns == now_ns]
-        seen.sort(key=lambda track: (track.track_id not in subjects, track.born_ns))
-        centres = np.array([self._anatomy.centre(measured[row[id(track)]]) for track in seen])
+        seen = [
+            (track.track_id not in subjects, track.born_ns, r)
+            for r, track in enumerate(self._tracks)
+            if track.triangulated_ns == now_ns and track in alive
+        ]
+        order = [r for *_, r in sorted(seen)]
+        same = _coincide(measured[order], self._options.duplicate_m / 2)
         doubled = []
-        for younger in range(len(seen)):
-            track = seen[younger]
-            near = np.linalg.norm(centres[:younger] - centres[younger], axis=1) < o.duplicate_m
-            if any(
-                _apart(measured[row[id(track)]], measured[row[id(seen[older])]])
-                < 0.5 * o.duplicate_m
-                for older in np.flatnonzero(near)
-            ):
-                if track.overlap_since_ns is None:
-                    track.overlap_since_ns = now_ns
-                if (now_ns - track.overlap_since_ns) * 1e-9 >= o.overlap_s:
-                    doubled.append(track)
-            else:
+        for place, r in enumerate(order):
+            track = self._tracks[r]
+            if not same[place, :place].any():
                 track.overlap_since_ns = None
+            elif track.overlap_since_ns is None:
+                track.overlap_since_ns = now_ns
+            elif (now_ns - track.overlap_since_ns) * 1e-9 >= self._options.overlap_s:
+                doubled.append(track)
         return doubled
 
     def _admit(self, now_ns: int) -> None:
@@ -495,6 +496,7 @@ class Tracker:
                 (track, "", TrackState.TENTATIVE)
                 for track in self._tracks
                 if track.track_id not in subjects
+                and track.strong_frames > 0
                 and not self._established(track)
                 and self._inside(track)
             ]
@@ -550,15 +552,19 @@ class Tracker:
         return f"person{number}"
 
 
-def _apart(
-    a: Float[np.ndarray, "k 3"], b: Float[np.ndarray, "k 3"], mirror: np.ndarray | None = None
-) -> float:
-    """Median distance [m] of common landmarks, of left to right where `mirror` makes it less."""
-    distance = np.linalg.norm(a - b, axis=1)
-    if mirror is not None:
-        distance = np.fmin(distance, np.linalg.norm(a - b[mirror], axis=1))
+def _apart(a: np.ndarray, b: np.ndarray, mirror: np.ndarray) -> float:
+    """Median distance [m] of two skeletons' common landmarks, or of left to right if less."""
+    distance = np.fmin(np.linalg.norm(a - b, axis=1), np.linalg.norm(a - b[mirror], axis=1))
     distance = distance[np.isfinite(distance)]
     return float(np.median(distance)) if len(distance) >= MIN_COMMON else np.inf
+
+
+def _coincide(landmarks: np.ndarray, limit_m: float) -> np.ndarray:
+    """Which skeletons of (t, k, 3) have most of their common landmarks within the limit (t, t)."""
+    apart = landmarks[:, None] - landmarks[None]
+    squared = np.einsum("abki,abki->abk", apart, apart)
+    common = np.isfinite(squared).sum(axis=2)
+    return ((squared < limit_m**2).sum(axis=2) > common / 2) & (common >= MIN_COMMON)
 
 
 def _misfit(a: np.ndarray, b: np.ndarray) -> float:
@@ -571,6 +577,4 @@ def _misfit(a: np.ndarray, b: np.ndarray) -> float:
 def _cheapest(cost: np.ndarray) -> list[tuple[int, int]]:
     """Pairs (row, column) of least total cost; infinite ones never."""
     rows, columns = linear_sum_assignment(np.where(np.isfinite(cost), cost, 1e6))
-    return [
-        (int(r), int(c)) for r, c in zip(rows, columns, strict=True) if np.isfinite(cost[r, c])
-    ]
+    return [(int(r), int(c)) for r, c in zip(rows, columns, strict=True) if np.isfinite(cost[r, c])]

@@ -46,15 +46,16 @@ class Views:
         return np.where(person >= 0, person - np.array(self.first[:-1]), -1)
 
     def distances(
-        self, landmarks: np.ndarray, mirror: np.ndarray, truncation_m: float
+        self, landmarks: np.ndarray, mirror: np.ndarray, truncation_m: float, wanted: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Distances [m] (t, n) of skeletons (t, k, 3) to all detections; and mirrored ones."""
+        """Distances [m] (t, n) of skeletons (t, k, 3) to the wanted detections; and mirrored."""
         direct = np.empty((len(landmarks), len(self.rays)))
         mirrored = np.empty_like(direct)
         kernels.match_distance(
             self.cameras,
             self.camera_of,
             self.rays,
+            wanted,
             landmarks,
             mirror,
             truncation_m,

@@ -32,7 +32,7 @@ _INTERVAL_S = DURATION_S + 2 * _MARGIN_S
 _CUTOFF_HZ = 8.0
 _MAX_SPEED_RAD_S = np.deg2rad(2000.0)
 """A bone that turns faster was mislabelled; the motion is bridged across it."""
-_BRIDGE_S = 0.05
+_BRIDGE_S = 0.1
 """Bridged on either side of what was mislabelled."""
 _FLOOR_WINDOW_S = 1.2
 """Within so long a foot touches the floor, also in a jump."""

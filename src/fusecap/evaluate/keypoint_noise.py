@@ -74,6 +74,8 @@ class KeypointNoise:
     """Of confidence about the value that belongs to the error."""
     min_keypoints: int = 4
     """People with fewer visible keypoints are not detected."""
+    min_height_px: float = 40.0
+    """Nor are those who appear smaller than this, in a 1920-pixel-wide image."""
 
 
 NO_KEYPOINT_NOISE = KeypointNoise(
@@ -87,6 +89,8 @@ NO_KEYPOINT_NOISE = KeypointNoise(
     outlier_share=0.0,
     spurious_share=0.0,
     confidence_sigma=0.0,
+    min_keypoints=1,
+    min_height_px=0.0,
 )
 """Every landmark that projects into the image, where it is."""
 
@@ -178,7 +182,7 @@ def detect(
 ) -> list[tuple[Float[np.ndarray, "n k 3"], Int[np.ndarray, " n"]]]:
     """Per frame one camera's keypoints (x px, y px, confidence), and whose they are (-1: nobody's).
 
-    People come in random order.
+    People come in random order; a missing keypoint is NaN, NaN, 0.
     """
     frames, people, count = landmarks_in_world_m.shape[:3]
     points = landmarks_in_world_m.reshape(frames, people * count, 3)
@@ -225,9 +229,10 @@ def detect(
         share=noise.person_miss_share,
         mean_frames=noise.person_miss_s * rate_hz,
     )
-    detected = (visible.sum(axis=2) >= noise.min_keypoints) & ~person_missed
+    large = apparent_px * camera.pixel_scale >= noise.min_height_px
+    detected = (visible.sum(axis=2) >= noise.min_keypoints) & large & ~person_missed
     found = np.concatenate([pixels, np.clip(confidence, 0.05, 1.0)[..., None]], axis=-1)
-    found[~visible] = 0.0
+    found[~visible] = [np.nan, np.nan, 0.0]
 
     picture, shown = _picture_on_the_wall(rng, camera, landmark_set, frames, noise, rate_hz)
     result = []

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from fusecap.errors import TakeError
 from fusecap.evaluate.metrics import (
@@ -59,11 +59,12 @@ def score_take(take: Take, truth: Take, *, gate_m: float = 0.5) -> TakeScore:
     match = match_people(position, true_position, gate_m=gate_m)
     person, frame = np.nonzero(match >= 0)
     found = match[person, frame]
-
     x, y = position[found, frame], true_position[person, frame]
     position_mm = position_error_m(x, y) * 1e3
     orientation_deg = np.degrees(
-        orientation_error_rad(rotation[found, rows[frame]], true_rotation[person, true_rows[frame]])
+        orientation_error_rad(
+            _rotations(take)[found, rows[frame]], _rotations(truth)[person, true_rows[frame]]
+        )
     )
     tracked = int(take.tracked[:, rows].sum())
     true_tracked = int(truth.tracked[:, true_rows].sum())
@@ -92,6 +93,13 @@ def _same_instants(
     nearest = np.searchsorted(between_ns, times_ns)
     same = np.abs(true_times_ns[nearest] - times_ns) <= SAME_INSTANT_NS
     return np.flatnonzero(same), nearest[same]
+
+
+def _rotations(take: Take) -> Float[np.ndarray, "s t b 3 3"]:
+    rotation = np.full((*take.bone_quality.shape, 3, 3), np.nan)
+    for subject in range(len(rotation)):
+        rotation[subject] = take.bone_rotation_in_world(subject)
+    return rotation
 
 
 def _per_bone(take: Take, errors: np.ndarray) -> dict[str, float]:

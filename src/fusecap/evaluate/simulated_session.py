@@ -128,13 +128,11 @@ def _imu_csv(simulation: Simulation, imus: SimulatedImus, sensor: int) -> str:
 
 
 def _openpose_json(people: Float[np.ndarray, "n k 3"]) -> str:
+    rows = np.nan_to_num(np.round(people, 3)).reshape(len(people), -1).tolist()
     return json.dumps(
         {
             "version": 1.3,
-            "people": [
-                {"person_id": [-1], "pose_keypoints_2d": np.round(person, 3).ravel().tolist()}
-                for person in people
-            ],
+            "people": [{"person_id": [-1], "pose_keypoints_2d": row} for row in rows],
         }
     )
 

@@ -23,7 +23,7 @@ def solve_simulation(
     associate: str = "tracker",
     progress: Progress | None = None,
 ) -> Solved:
-    """Solve with the heights and start positions of the subjects known, as a session states them."""
+    """Solve knowing the heights and start positions of the subjects, as a session states them."""
     people = simulation.subjects
     skeleton = people[0].shape.skeleton
     models = []

@@ -53,7 +53,7 @@ class Simulation:
     """The subjects, without bystanders."""
     detections: tuple[Detections, ...]
     """Per frame."""
-    detected_person: tuple[tuple[Int[np.ndarray, " n"], ...], ...]
+    detected_person: tuple[tuple[Int[np.ndarray, " _"], ...], ...]
     """Per frame and camera: whose each detection is, an index into `people`, or -1."""
     imus: dict[str, SimulatedImus]
     """Per subject that wears any."""

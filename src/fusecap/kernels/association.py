@@ -50,13 +50,18 @@ def undistort(cameras, camera_of, keypoints, rays_out):
                     dy = v - (y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y)
                     x += dx
                     y += dy
-                    if dx * dx + dy * dy < 1e-20:
+                    if dx * dx + dy * dy < 1e-16:
                         break
                 if not x * x + y * y <= cam[_MAX_R2]:
                     continue
             rays_out[n, k, 0] = x
             rays_out[n, k, 1] = y
             rays_out[n, k, 2] = min(confidence, 1.0)
+
+
+@kernel("f8(f8, f8)")
+def _length(x, y):
+    return math.sqrt(x * x + y * y)
 
 
 @kernel("UniTuple(f8, 3)(f8[::1], f8[::1])")
@@ -69,13 +74,14 @@ def _in_camera(cam, point):
 
 
 @kernel(
-    "void(f8[:, ::1], i8[::1], f8[:, :, ::1], f8[:, :, ::1], i8[::1], f8, i8, "
+    "void(f8[:, ::1], i8[::1], f8[:, :, ::1], b1[::1], f8[:, :, ::1], i8[::1], f8, i8, "
     "f8[:, ::1], f8[:, ::1])"
 )
 def match_distance(
     cameras,
     camera_of,
     rays,
+    wanted,
     points_in_world,
     mirror,
     truncation_m,
@@ -86,13 +92,17 @@ def match_distance(
     """Mean distance [m] (t, n) of each skeleton to each detection, and to it mirrored.
 
     Weighted by confidence, each landmark's distance truncated; infinite where fewer than
-    `min_common` landmarks are known in both.
+    `min_common` landmarks are known in both, and for detections (n,) that are not `wanted`.
     """
     tracks, landmarks = points_in_world.shape[:2]
     projected = np.empty((landmarks, 3))
     for t in range(tracks):
         last = -1
         for n in range(len(rays)):
+            if not wanted[n]:
+                distance_out[t, n] = np.inf
+                mirrored_out[t, n] = np.inf
+                continue
             camera = camera_of[n]
             if camera != last:
                 last = camera
@@ -109,7 +119,7 @@ def match_distance(
                     continue
                 w = rays[n, k, 2]
                 if w > 0.0:
-                    d = z * math.hypot(
+                    d = z * _length(
                         rays[n, k, 0] - projected[k, 0], rays[n, k, 1] - projected[k, 1]
                     )
                     total += w * min(d, truncation_m)
@@ -118,7 +128,7 @@ def match_distance(
                 m = mirror[k]
                 w = rays[n, m, 2]
                 if w > 0.0:
-                    d = z * math.hypot(
+                    d = z * _length(
                         rays[n, m, 0] - projected[k, 0], rays[n, m, 1] - projected[k, 1]
                     )
                     total_mirrored += w * min(d, truncation_m)
@@ -193,9 +203,9 @@ def triangulate_pairs(
             point[1] = 0.5 * (ay + along_a * uy + by + along_b * vy)
             point[2] = 0.5 * (az + along_a * uz + bz + along_b * vz)
             x, y, z = _in_camera(cam_a, point)
-            total += 0.5 * px_a * math.hypot(x / z - rays[a, k, 0], y / z - rays[a, k, 1])
+            total += 0.5 * px_a * _length(x / z - rays[a, k, 0], y / z - rays[a, k, 1])
             x, y, z = _in_camera(cam_b, point)
-            total += 0.5 * px_b * math.hypot(x / z - rays[b, k, 0], y / z - rays[b, k, 1])
+            total += 0.5 * px_b * _length(x / z - rays[b, k, 0], y / z - rays[b, k, 1])
             points_out[h, k] = point
             good += 1
             if total > max_error_px * common:
@@ -246,30 +256,41 @@ def _add_row(cam, x, y, offset_x, offset_y, weight, h, g):
 
 @kernel("f8(f8[:, ::1], i8[::1], f8[:, ::1], i8, f8, f8[::1], f8[::1])")
 def _residuals(cameras, camera, row, views, scale_px, point, residual_px_out):
-    """Cauchy cost of a point; its residual per view [px at 1920], infinite behind a camera."""
+    """Truncated square cost of a point; its residual per view [px at 1920], inf behind a camera."""
     cost = 0.0
     for v in range(views):
         x, y, z = _in_camera(cameras[camera[v]], point)
+        residual_px_out[v] = np.inf
         if z > 0.0:
-            residual_px_out[v] = row[v, 3] * math.hypot(x / z - row[v, 0], y / z - row[v, 1])
-            cost += row[v, 2] * math.log1p((residual_px_out[v] / scale_px) ** 2)
-        else:
-            residual_px_out[v] = np.inf
-            cost += row[v, 2] * 100.0
+            residual_px_out[v] = row[v, 3] * _length(x / z - row[v, 0], y / z - row[v, 1])
+        cost += row[v, 2] * min(residual_px_out[v] / scale_px, _OUTLIER) ** 2
     return cost
 
 
-@kernel("b1(f8[:, ::1], i8[::1], f8[:, ::1], i8, i8, i8, f8[:, ::1], f8[::1], f8[::1])")
-def _linear(cameras, camera, row, views, first, second, h, g, point_out):
-    """DLT of all views, or of two when `first` >= 0."""
+@kernel("b1(f8[:, ::1], i8[::1], f8[:, ::1], i8, i8, f8[:, ::1], f8[::1], f8[::1])")
+def _linear(cameras, camera, row, views, without, h, g, point_out):
+    """DLT of all views but one (-1: of all)."""
     h[:] = 0.0
     g[:] = 0.0
     for v in range(views):
-        if first < 0 or v == first or v == second:
+        if v != without:
             cam = cameras[camera[v]]
             x, y = row[v, 0], row[v, 1]
             weight = row[v, 2] * row[v, 3] ** 2
             _add_row(cam, x, y, cam[9] - x * cam[11], cam[10] - y * cam[11], weight, h, g)
+    return _solve3(h, g, point_out)
+
+
+@kernel("b1(f8[:, ::1], i8[::1], f8[:, ::1], i8, i8, f8[:, ::1], f8[::1], f8[::1])")
+def _of_two(cameras, camera, row, first, second, h, g, point_out):
+    """DLT of two views."""
+    h[:] = 0.0
+    g[:] = 0.0
+    for v in (first, second):
+        cam = cameras[camera[v]]
+        x, y = row[v, 0], row[v, 1]
+        weight = row[v, 2] * row[v, 3] ** 2
+        _add_row(cam, x, y, cam[9] - x * cam[11], cam[10] - y * cam[11], weight, h, g)
     return _solve3(h, g, point_out)
 
 
@@ -280,23 +301,36 @@ def _triangulate_point(cameras, camera, row, views, scale_px, h, g, points, resi
     """Point of least Cauchy cost [1, eq. 17] and its mean error over inliers; NaN without two.
 
     `row` holds per view x, y, confidence and pixels (at 1920) per unit of x. The linear solution
-    is the start, or, where a view contradicts it, the best two-view solution.
+    is the start; where a view contradicts it, that without the worst view; where that does not
+    help either, the best solution of two views.
     """
     best, trial = points[0], points[1]
+    limit_px = _OUTLIER * scale_px
     point_out[:] = np.nan
     cost = np.inf
-    worst = np.inf
-    if _linear(cameras, camera, row, views, -1, -1, h, g, best):
+    worst = -1
+    if _linear(cameras, camera, row, views, -1, h, g, best):
         cost = _residuals(cameras, camera, row, views, scale_px, best, residual_px)
-        worst = residual_px[:views].max()
-    if views > 2 and worst > _OUTLIER * scale_px:
-        for first in range(views):
-            for second in range(first):
-                if _linear(cameras, camera, row, views, first, second, h, g, trial):
-                    other = _residuals(cameras, camera, row, views, scale_px, trial, residual_px)
-                    if other < cost:
-                        cost = other
-                        best[:] = trial
+        worst = np.argmax(residual_px[:views])
+    if views > 2 and (worst < 0 or residual_px[worst] > limit_px):
+        settled = False
+        if worst >= 0 and _linear(cameras, camera, row, views, worst, h, g, trial):
+            other = _residuals(cameras, camera, row, views, scale_px, trial, residual_px)
+            residual_px[worst] = 0.0
+            settled = views > 3 and residual_px[:views].max() <= limit_px
+            if other < cost:
+                cost = other
+                best[:] = trial
+        if not settled:
+            for first in range(views):
+                for second in range(first):
+                    if _of_two(cameras, camera, row, first, second, h, g, trial):
+                        other = _residuals(
+                            cameras, camera, row, views, scale_px, trial, residual_px
+                        )
+                        if other < cost:
+                            cost = other
+                            best[:] = trial
     if not math.isfinite(cost):
         return np.nan
     for _ in range(4):
@@ -323,7 +357,7 @@ def _triangulate_point(cameras, camera, row, views, scale_px, h, g, points, resi
     inliers = 0
     error = 0.0
     for v in range(views):
-        if residual_px[v] < _OUTLIER * scale_px:
+        if residual_px[v] < limit_px:
             inliers += 1
             error += residual_px[v]
     if inliers < 2:
@@ -375,7 +409,7 @@ def _view_distance(cam, ray, points, truncation_m, min_common):
             x, y, z = _in_camera(cam, points[k])
             d = truncation_m
             if z > 0.0:
-                d = min(d, z * math.hypot(ray[k, 0] - x / z, ray[k, 1] - y / z))
+                d = min(d, z * _length(ray[k, 0] - x / z, ray[k, 1] - y / z))
             total += w * d
             weight += w
             common += 1
@@ -467,3 +501,32 @@ def drop_contradicting_views(
                     least = remaining
                     out = c
             person[t, out] = -1
+
+
+@kernel("void(f8[:, :, ::1], f8[:, :, ::1], f8[::1], f8, f8, f8[:, :, ::1], f8[:, :, ::1])")
+def move_tracks(measured, predicted, dt_s, position_gain, velocity_gain, landmarks, velocity):
+    """Constant-velocity update, in place, of landmarks [m] (t, k, 3) and velocities [m/s].
+
+    A landmark without a measurement moves by the median news of the others; one that had no
+    prediction starts where it is measured.
+    """
+    tracks, count = landmarks.shape[:2]
+    news = np.empty(count)
+    for t in range(tracks):
+        for i in range(3):
+            known = 0
+            for k in range(count):
+                d = measured[t, k, i] - predicted[t, k, i]
+                if math.isfinite(d):
+                    news[known] = d
+                    known += 1
+            common = np.median(news[:known]) if known else 0.0
+            for k in range(count):
+                d = measured[t, k, i] - predicted[t, k, i]
+                moved = predicted[t, k, i] + position_gain * (d if math.isfinite(d) else common)
+                if not math.isfinite(moved):
+                    moved = measured[t, k, i]
+                latest = (moved - landmarks[t, k, i]) / dt_s[t]
+                if math.isfinite(latest):
+                    velocity[t, k, i] += velocity_gain * (latest - velocity[t, k, i])
+                landmarks[t, k, i] = moved

@@ -3,11 +3,16 @@
 Root translation, then one exponential map [rad] per joint of the tree below, 120 rows a second.
 The matrices act on row vectors, so a joint's rotation is exp(-v). Row 0 is a rest pose and is
 dropped. The file has no bone lengths; the tree carries those of one adult of the database.
+
+The root was converted with its angles in another order than every other joint: where the same take
+exists as BVH, its rotation is Rz Ry Rx, and the exponential map is that of Rz Rx Ry with the same
+three angles. They are taken out and put together again as BVH has them, with |y| <= 90 degrees.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from fusecap.calibrate.motion_files.motion import (
@@ -76,6 +81,7 @@ def parse_expmap(text: str, name: str) -> Motion:
     values = np.array([numbers(row, f"{name}, row {i}") for i, row in enumerate(rows[1:], start=2)])
     turns = -values[:, 3:].reshape(-1, 3)
     local = Rotation.from_rotvec(turns).as_matrix().reshape(len(values), len(_TREE), 3, 3)
+    local[:, 0] = _root_as_in_bvh(local[:, 0])
     return Motion(
         name=name,
         joint_names=tuple(joint for joint, _, _ in _TREE),
@@ -85,3 +91,12 @@ def parse_expmap(text: str, name: str) -> Motion:
         rotation_in_world=chain_rotations(_PARENTS, local),
         rate_hz=RATE_HZ,
     )
+
+
+def _root_as_in_bvh(rotation: Float[np.ndarray, "t 3 3"]) -> Float[np.ndarray, "t 3 3"]:
+    """Rz Ry Rx from Rz Rx Ry of the same angles."""
+    z, x, y = Rotation.from_matrix(rotation).as_euler("ZXY").T
+    other = np.abs(y) > np.pi / 2
+    z, y = (np.where(other, angle + np.pi, angle) for angle in (z, y))
+    x = np.where(other, np.pi - x, x)
+    return Rotation.from_euler("ZYX", np.stack([z, y, x], axis=1)).as_matrix()

@@ -64,7 +64,8 @@ def _orientation_wxyz(table: Table) -> np.ndarray:
         return table.take(_QUATERNION)
     if table.has(_MATRIX):
         numbers = table.take(_MATRIX).reshape(-1, 3, 3)
-        usable = np.nan_to_num(np.linalg.det(numbers)) > 0.1
+        usable = np.isfinite(numbers).all(axis=(1, 2))
+        usable &= np.linalg.det(np.nan_to_num(numbers)) > 0.1
         rotation = Rotation.from_matrix(numbers[usable]) if usable.any() else None
     elif table.has(_EULER_XYZ):
         numbers = table.take(_EULER_XYZ)

@@ -1,0 +1,5 @@
+"""`python -m fusecap`."""
+
+from fusecap.cli import main
+
+main()

@@ -1,0 +1,366 @@
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from fusecap.body.landmarks import landmark_set_named
+from fusecap.body.pose import forward_kinematics, landmarks_in_world
+from fusecap.errors import InputError
+from fusecap.evaluate.demo_scene import VOLUME_M, demo_scene
+from fusecap.evaluate.imu_noise import (
+    GRAVITY_IN_WORLD_M_S2,
+    IMUS_6,
+    IMUS_13,
+    NO_IMU_NOISE,
+    ImuNoise,
+    measure,
+)
+from fusecap.evaluate.keypoint_noise import NO_KEYPOINT_NOISE, KeypointNoise
+from fusecap.evaluate.noise import bursts, correlated_noise
+from fusecap.evaluate.simulated_session import write_session
+from fusecap.evaluate.simulator import Person, camera_ring, placed, simulate
+from fusecap.sinks.take import load_take
+from fusecap.sources.session import load_session
+from fusecap.sources.session_data import open_session
+from motions import person, walk
+
+BODY25 = landmark_set_named("body25")
+RIG = camera_ring(3)
+
+
+def two_and_a_bystander(frames=40, *, imu_bones=IMUS_13):
+    theta = walk(person(), frames)
+    return [
+        Person(
+            name="anna",
+            shape=person(),
+            theta=placed(theta, centre_m=(-0.8, 0.0)),
+            imu_bones=imu_bones,
+        ),
+        Person(
+            name="ben",
+            shape=person(1.9),
+            theta=placed(theta, turn_rad=2.0, centre_m=(0.8, 0.0), scale=1.9 / 1.75),
+            imu_bones=imu_bones,
+        ),
+        Person(
+            name="guest",
+            shape=person(1.6),
+            theta=placed(theta, turn_rad=1.0, centre_m=(0.0, -1.5)),
+            bystander=True,
+        ),
+    ]
+
+
+def captured(people, *, seed=3, rig=RIG, keypoint_noise=None, imu_noise=None, rate_hz=60.0):
+    return simulate(
+        people,
+        rig,
+        BODY25,
+        rate_hz=rate_hz,
+        seed=seed,
+        keypoint_noise=keypoint_noise,
+        imu_noise=imu_noise,
+    )
+
+
+def images(simulation, person_index):
+    """True landmarks of one person in each camera (C, T, K, 2)."""
+    one = simulation.people[person_index]
+    position, rotation = forward_kinematics(one.shape, one.theta)
+    points = landmarks_in_world(
+        position, rotation, BODY25.bones(one.shape.skeleton), BODY25.offsets_m(one.shape)
+    )
+    return np.stack(
+        [
+            camera.project(points.reshape(-1, 3)).reshape(*points.shape[:2], 2)
+            for camera in simulation.rig.cameras
+        ]
+    )
+
+
+def detections_of(simulation, person_index):
+    """(C, T, K, 3); NaN where the person is not detected."""
+    rig, frames = simulation.rig, len(simulation.detections)
+    found = np.full((len(rig), frames, len(BODY25.landmark_names), 3), np.nan)
+    for frame, detections in enumerate(simulation.detections):
+        for camera, people in enumerate(detections.people):
+            whose = simulation.detected_person[frame][camera]
+            assert len(whose) == len(people)
+            for row in np.flatnonzero(whose == person_index):
+                found[camera, frame] = people[row]
+    return found
+
+
+def test_without_noise_keypoints_are_images_of_landmarks():
+    simulation = captured(two_and_a_bystander(), keypoint_noise=NO_KEYPOINT_NOISE)
+    for index in range(3):
+        found, true = detections_of(simulation, index), images(simulation, index)
+        assert np.isfinite(found[..., 2]).all()
+        seen = found[..., 2] > 0
+        assert seen.mean() > 0.95
+        assert np.allclose(found[seen][:, :2], true[seen], atol=1e-9)
+
+
+def test_without_noise_imus_are_the_bones():
+    simulation = captured(two_and_a_bystander(), imu_noise=NO_IMU_NOISE)
+    assert set(simulation.imu_readings) == {"anna", "ben"}
+    for subject, readings in simulation.imu_readings.items():
+        one = simulation.truth.subject(subject)
+        bones = [simulation.truth.bone_names.index(name) for name in IMUS_13]
+        rotation = simulation.truth.bone_rotation_in_world(one)[:, bones]
+        position = simulation.truth.bone_position_in_world_m[one][:, bones]
+        at = simulation.imus[subject].position_in_bone_m
+        place = position + np.einsum("tijk,ik->tij", rotation, at)
+        accel = (place[2:] - 2 * place[1:-1] + place[:-2]) * 60.0**2
+        assert np.allclose([r.bone_rotation_in_world for r in readings], rotation, atol=1e-12)
+        measured = np.array([r.accel_in_world_m_s2 for r in readings])
+        assert np.allclose(measured[1:-1], accel, atol=1e-8)
+
+
+def test_imu_at_rest_measures_gravity_upwards(rng):
+    position = np.zeros((5, 21, 3))
+    rotation = np.broadcast_to(Rotation.random(21, rng).as_matrix(), (5, 21, 3, 3)).copy()
+    imus = measure(rng, person(), position, rotation, IMUS_6, NO_IMU_NOISE, 60.0)
+    force_in_world = np.einsum("tijk,tik->tij", imus.world_from_imu, imus.accel_m_s2)
+    assert np.allclose(force_in_world, GRAVITY_IN_WORLD_M_S2)
+    assert GRAVITY_IN_WORLD_M_S2[1] == 9.80665
+
+
+def test_imu_errors_are_as_large_as_stated():
+    noise = ImuNoise(misalignment_deg=4.0, heading_deg=0.0, orientation_deg=0.0)
+    still = np.tile(walk(person(), 1), (3, 1))
+    people = [
+        Person(name=str(n), shape=person(), theta=still, imu_bones=IMUS_13) for n in range(60)
+    ]
+    rig = camera_ring(0)
+    errors = []
+    for name, readings in captured(people, rig=rig, imu_noise=noise).imu_readings.items():
+        _, truth = forward_kinematics(person(), still)
+        bones = [person().skeleton.bone(bone) for bone in IMUS_13]
+        measured = np.array([r.bone_rotation_in_world for r in readings])
+        relative = np.swapaxes(truth[:, bones], -1, -2) @ measured
+        assert np.allclose(relative[0], relative[-1]), name
+        errors.append(Rotation.from_matrix(relative[0]).as_rotvec(degrees=True))
+    assert np.std(errors) == pytest.approx(4.0, rel=0.05)
+
+
+def same(a, b) -> bool:
+    return all(
+        np.array_equal(p, q, equal_nan=True)
+        for x, y in zip(a.detections, b.detections, strict=True)
+        for p, q in zip(x.people, y.people, strict=True)
+    )
+
+
+def test_seed_decides_every_bit():
+    people = two_and_a_bystander()
+    first, again, other = (captured(people, seed=seed) for seed in (5, 5, 6))
+    assert same(first, again) and not same(first, other)
+    for name, imus in first.imus.items():
+        assert np.array_equal(imus.world_from_imu, again.imus[name].world_from_imu)
+        assert np.array_equal(imus.accel_m_s2, again.imus[name].accel_m_s2)
+        assert not np.array_equal(imus.accel_m_s2, other.imus[name].accel_m_s2)
+
+
+def test_imus_leave_the_keypoints_as_they_were():
+    assert same(captured(two_and_a_bystander()), captured(two_and_a_bystander(imu_bones=IMUS_6)))
+
+
+def test_bystander_is_seen_and_is_in_no_truth():
+    simulation = captured(two_and_a_bystander())
+    assert simulation.truth.subject_names == ("anna", "ben")
+    assert simulation.truth.provenance["simulated"] is True
+    assert np.isfinite(detections_of(simulation, 2)).any()
+    assert "guest" not in simulation.imus
+
+
+def test_people_come_in_random_order():
+    orders = {tuple(views[0]) for views in captured(two_and_a_bystander()).detected_person}
+    assert len(orders) > 3
+
+
+def test_person_behind_another_is_occluded_and_not_the_one_in_front():
+    noise = KeypointNoise(**{**vars(NO_KEYPOINT_NOISE), "occluded_seen_share": 0.0})
+    camera = camera_ring(1, height_m=0.9)
+    toward = camera.cameras[0].position_in_world * [1, 0, 1]
+    toward /= np.linalg.norm(toward)
+    still = np.tile(walk(person(), 1), (4, 1))
+    turn = np.pi / 4
+    front, back = (
+        placed(still, turn_rad=turn, centre_m=(d * toward[0], d * toward[2])) for d in (0.4, -0.4)
+    )
+    people = [
+        Person(name="back", shape=person(), theta=back),
+        Person(name="front", shape=person(), theta=front),
+    ]
+    simulation = captured(people, rig=camera, keypoint_noise=noise)
+    hidden = detections_of(simulation, 0)[0, 0, :, 2] == 0
+    open_ = detections_of(simulation, 1)[0, 0, :, 2] > 0
+    trunk = [BODY25.landmark_names.index(name) for name in ("mid_hip", "neck")]
+    assert hidden[trunk].all()
+    assert open_.mean() > 0.9
+
+
+def test_keypoint_error_has_the_stated_size():
+    noise = KeypointNoise(**{**vars(NO_KEYPOINT_NOISE), "sigma_px": 5.0, "correlation_s": 0.0})
+    people = two_and_a_bystander(400)[:1]
+    for size_px, focal_px in (((1920, 1080), 1150.0), ((960, 540), 575.0)):
+        rig = camera_ring(2, size_px=size_px, focal_px=focal_px)
+        simulation = captured(people, rig=rig, keypoint_noise=noise)
+        found, true = detections_of(simulation, 0), images(simulation, 0)
+        depth = np.stack(
+            [
+                people[0].theta[:, :3] @ camera.rotation[2] + camera.translation[2]
+                for camera in rig.cameras
+            ]
+        )
+        apparent = focal_px * 1.75 / depth
+        seen = found[..., 2] > 0
+        unit = ((found[..., :2] - true) * 600.0 / apparent[..., None, None])[seen]
+        assert np.std(unit) == pytest.approx(5.0, rel=0.03)
+
+
+def test_confidence_falls_with_the_error():
+    simulation = captured(
+        two_and_a_bystander(200)[:1],
+        keypoint_noise=KeypointNoise(**{**vars(NO_KEYPOINT_NOISE), "sigma_px": 5.0}),
+    )
+    found, true = detections_of(simulation, 0), images(simulation, 0)
+    seen = found[..., 2] > 0
+    error = np.linalg.norm((found[..., :2] - true)[seen], axis=-1)
+    assert np.corrcoef(error, found[..., 2][seen])[0, 1] < -0.3
+    assert found[seen][:, 2].max() <= 1.0
+
+
+def test_swapped_sides_are_each_others_images():
+    noise = KeypointNoise(**{**vars(NO_KEYPOINT_NOISE), "swap_share": 1.0})
+    simulation = captured(two_and_a_bystander(5)[:1], keypoint_noise=noise)
+    found, true = detections_of(simulation, 0), images(simulation, 0)
+    swapped = true[:, :, BODY25.mirror]
+    face = [n.split("_")[-1] in ("eye", "ear") for n in BODY25.landmark_names]
+    expected = np.where(np.array(face)[:, None], true, swapped)
+    seen = found[..., 2] > 0
+    assert np.allclose(found[..., :2][seen], expected[seen])
+
+
+def test_outliers_stay_in_the_persons_box():
+    noise = KeypointNoise(**{**vars(NO_KEYPOINT_NOISE), "outlier_share": 1.0})
+    simulation = captured(two_and_a_bystander(5)[:1], keypoint_noise=noise)
+    found, true = detections_of(simulation, 0), images(simulation, 0)
+    assert (found[..., :2] >= true.min(axis=2, keepdims=True)).all()
+    assert (found[..., :2] <= true.max(axis=2, keepdims=True)).all()
+    assert found[..., 2].max() <= 0.6
+
+
+def test_picture_on_the_wall_is_nobodys():
+    noise = KeypointNoise(**{**vars(NO_KEYPOINT_NOISE), "spurious_share": 1.0})
+    simulation = captured(two_and_a_bystander(5), keypoint_noise=noise)
+    for detections, whose in zip(simulation.detections, simulation.detected_person, strict=True):
+        for people, indices in zip(detections.people, whose, strict=True):
+            assert sorted(indices) == [-1, 0, 1, 2]
+            assert people[np.flatnonzero(indices == -1)[0], :, 2].max() <= 0.5
+
+
+def test_person_out_of_every_view_is_in_no_detection():
+    away = Person(
+        name="away", shape=person(), theta=placed(walk(person(), 4), centre_m=(500.0, 0.0))
+    )
+    noise = KeypointNoise(spurious_share=0.0)
+    simulation = captured([*two_and_a_bystander(4)[:1], away], keypoint_noise=noise)
+    assert np.isnan(detections_of(simulation, 1)).all()
+    alone = captured([away], keypoint_noise=noise, rig=camera_ring(2, radius_m=2.0))
+    assert alone.detections[0].people[0].shape == (0, 25, 3)
+
+
+def test_missing_keypoint_is_nan_with_confidence_zero():
+    for detections in captured(two_and_a_bystander()).detections:
+        for people in detections.people:
+            missing = people[..., 2] == 0
+            assert np.isnan(people[missing][:, :2]).all()
+            assert np.isfinite(people[~missing]).all()
+
+
+def test_motions_of_different_length_are_refused():
+    people = [*two_and_a_bystander(4)[:1], *two_and_a_bystander(5)[1:2]]
+    with pytest.raises(InputError, match="one length"):
+        captured(people)
+
+
+@pytest.mark.parametrize(("share", "mean"), [(0.05, 10.0), (0.5, 4.0), (0.0, 5.0), (1.0, 5.0)])
+def test_bursts_have_the_stated_share_and_length(rng, share, mean):
+    active = bursts(rng, 4000, (50,), share=share, mean_frames=mean)
+    assert active.mean() == pytest.approx(share, rel=0.1)
+    if 0 < share < 1:
+        starts = (np.diff(active.astype(int), axis=0) == 1).sum()
+        assert active.sum() / starts == pytest.approx(mean, rel=0.1)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 5.0])
+def test_correlated_noise_is_unit_and_correlated_as_stated(rng, correlation):
+    noise = correlated_noise(rng, 4000, (50,), correlation)
+    assert noise.std() == pytest.approx(1.0, rel=0.02)
+    lag = 5
+    expected = np.exp(-lag / correlation) if correlation else 0.0
+    assert (noise[lag:] * noise[:-lag]).mean() == pytest.approx(expected, abs=0.02)
+
+
+def test_ring_cameras_look_at_the_axis_and_stand_upright():
+    rig = camera_ring(5, radius_m=4.0, height_m=2.0, target_height_m=1.0, size_px=(801, 601))
+    assert rig.names == ("cam1", "cam2", "cam3", "cam4", "cam5")
+    for camera in rig.cameras:
+        place = camera.position_in_world
+        assert np.hypot(place[0], place[2]) == pytest.approx(4.0)
+        assert place[1] == pytest.approx(2.0)
+        target, above = camera.project(np.array([[0.0, 1.0, 0.0], [0.0, 1.5, 0.0]]))
+        assert np.allclose(target, [400.0, 300.0])
+        assert above[0] == pytest.approx(400.0) and above[1] < 300.0
+
+
+def test_placed_motion_is_the_same_motion_elsewhere():
+    theta = walk(person(), 30)
+    turn = Rotation.from_rotvec([0, 1.1, 0])
+    before, _ = forward_kinematics(person(), theta)
+    after, _ = forward_kinematics(person(), placed(theta, turn_rad=1.1, centre_m=(3.0, 4.0)))
+    turned = turn.apply(before.reshape(-1, 3)).reshape(before.shape)
+    shift = after - turned
+    assert np.allclose(shift, shift[0, 0], atol=1e-12) and shift[0, 0, 1] == pytest.approx(0.0)
+    path = after[:, 0]
+    assert np.allclose(((path.min(axis=0) + path.max(axis=0)) / 2)[[0, 2]], [3.0, 4.0], atol=0.05)
+
+
+def test_demo_has_its_subjects_inside_and_the_bystander_outside():
+    scene = demo_scene(seconds=2.0)
+    assert scene.truth.subject_names == ("anna", "ben")
+    assert len(scene.rig) == 4 and len(scene.people) == 3
+    assert all(imus.bones == IMUS_13 for imus in scene.imus.values())
+    for one in demo_scene().people:
+        x, z = one.theta[:, 0], one.theta[:, 2]
+        inside = (VOLUME_M[0] < x) & (x < VOLUME_M[1]) & (VOLUME_M[2] < z) & (z < VOLUME_M[3])
+        assert not inside.any() if one.bystander else inside.all()
+
+
+@pytest.mark.parametrize("seconds", [0.0, 1e4])
+def test_demo_of_impossible_length_is_refused(seconds):
+    with pytest.raises(InputError, match="demo lasts"):
+        demo_scene(seconds=seconds)
+
+
+def test_written_session_reads_back_as_the_simulation(tmp_path):
+    scene = demo_scene(2, seconds=0.5)
+    data = open_session(load_session(write_session(scene, tmp_path / "demo")))
+    assert data.rig.names == scene.rig.names
+    for read, made in zip(data.rig.cameras, scene.rig.cameras, strict=True):
+        assert np.allclose(read.packed, made.packed)
+    assert np.abs(data.timestamps_ns - scene.truth.timestamps_ns).max() <= 1
+    for frame in range(30):
+        people = data.detections(frame).people
+        for read, made in zip(people, scene.detections[frame].people, strict=True):
+            assert np.allclose(read, made, atol=1e-3, equal_nan=True)
+    for imus in data.imus:
+        assert imus.bones == scene.imus[imus.subject].bones
+        for frame, made in enumerate(scene.imu_readings[imus.subject]):
+            read = imus.reading(frame)
+            assert np.allclose(read.bone_rotation_in_world, made.bone_rotation_in_world, atol=1e-6)
+            assert np.allclose(read.accel_in_world_m_s2, made.accel_in_world_m_s2, atol=1e-5)
+    truth = load_take(tmp_path / "demo" / "truth.npz")
+    assert np.array_equal(truth.theta, scene.truth.theta)
