@@ -48,7 +48,7 @@ def walker(
     times_s: np.ndarray,
     height_m: float = 1.75,
 ) -> np.ndarray:
-    """Landmarks (t, k, 3) of somebody on `path(times) -> x, z, heading` who swings arms and legs."""
+    """Landmarks (t, k, 3) of somebody on `path(times) -> x, z, heading`, swinging arms and legs."""
     shape = BodyShape.from_height(PAPER21, height_m)
     theta = np.zeros((len(times_s), PAPER21.pose_size))
     x, z, heading = path(times_s)

@@ -66,6 +66,7 @@ def test_turned_camera_disagrees_with_the_others(tmp_path):
     assert "recalibrate" in findings[0].remedy
 
 
+@pytest.mark.slow
 def test_late_camera_is_told_its_offset(tmp_path):
     path = write_session(tmp_path, frames=120)
     edit(path, 'name = "cam1"', 'name = "cam1"\noffset_s = 0.4')
@@ -173,6 +174,25 @@ def test_imu_without_mounting_is_an_error(tmp_path):
     assert any("tpose_s" in text for text in said(path, "error"))
 
 
+@pytest.mark.slow
+@pytest.mark.real_data
+def test_pose2sim_clip_read_in_the_wrong_order_is_told_the_right_one(data_dir, tmp_path):
+    folder = data_dir / "pose2sim_demo/v0.8.4_openpose_body25b"
+    with tarfile.open(folder / "pose_json.tar.xz") as archive:
+        archive.extractall(tmp_path, filter="data")
+    trial = "S00_P00_SingleParticipant/S00_P00_T01_BalancingTrial/pose"
+    text = f'[session]\nname = "a"\ncalibration = "{folder}/Calib.qca.txt"\nup = "z"\n'
+    for camera in ("01", "02", "03", "04"):
+        text += f'[[camera]]\nname = "cam_{camera}"\nformat = "openpose-body25b"\n'
+        text += f'keypoints = "{trial}/cam{camera}_json"\n'
+    (tmp_path / "session.toml").write_text(text)
+    assert said(tmp_path, "error") == []
+    (tmp_path / "session.toml").write_text(text.replace('"openpose-body25b"', '"openpose-body25"'))
+    errors = said(tmp_path, "error")
+    assert len(errors) == 4 and all("'openpose-body25b'" in error for error in errors)
+
+
+@pytest.mark.slow
 @pytest.mark.real_data
 def test_shelf_is_sound_and_its_wrong_axis_is_found(data_dir, tmp_path):
     with tarfile.open(data_dir / "shelf/openpose_body25.tar.xz") as archive:

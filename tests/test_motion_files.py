@@ -118,6 +118,18 @@ def test_expmap_rotations_act_on_rows(rng):
     np.testing.assert_allclose(motion.root_position_m[0], np.array([1, 17, 2]) * CMU_UNIT_M)
 
 
+def test_expmap_root_that_turns_round_turns_evenly():
+    heading = np.linspace(0.0, 4 * np.pi, 400)
+    tilt = np.full_like(heading, 0.1)
+    # The angles of Rz Ry Rx, put together as the files have them.
+    as_filed = Rotation.from_euler("ZXY", np.stack([0.5 * tilt, tilt, heading], axis=1))
+    vectors = np.zeros((400, 38, 3))
+    vectors[:, 0] = -as_filed.as_rotvec()
+    motion = parse_expmap(expmap_text(vectors), "turn.txt")
+    expected = Rotation.from_euler("ZYX", np.stack([0.5 * tilt, heading, tilt], axis=1))
+    np.testing.assert_allclose(motion.rotation_in_world[:, 0], expected.as_matrix(), atol=1e-9)
+
+
 def test_expmap_row_of_wrong_width_is_named():
     text = expmap_text(np.zeros((3, 38, 3)))
     with pytest.raises(InputError, match="row 4 has 115 numbers; expected 117"):

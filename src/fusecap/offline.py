@@ -29,11 +29,11 @@ from fusecap.body.skeleton import Skeleton
 from fusecap.errors import SessionError
 from fusecap.geometry.camera import Rig
 from fusecap.pipeline import Pipeline, Sorter, observation_of
-from fusecap.reprojection import Reprojection
 from fusecap.sinks.take import Take, TakeBuilder, provenance
 from fusecap.solve.estimator import SubjectModel
 from fusecap.solve.options import SolverOptions, Weights
 from fusecap.solve.pose_solver import ImuSites
+from fusecap.solve.reprojection import Reprojection
 from fusecap.sources.session import Session, SubjectSettings
 from fusecap.sources.session_data import SessionData
 from fusecap.types import Detections, Estimate, ImuReading, TrackState, TrackUpdate

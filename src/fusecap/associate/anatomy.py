@@ -1,10 +1,10 @@
 """What a human body can measure: limbs whose length does not depend on the pose.
 
 Lengths come from the reference proportions of `BodyShape` for people of 1.0 m to 2.2 m, widened by
-40 % because a detector's joints scatter by some centimetres and trunks bend. An adult's thigh (0.43
-m) may so measure 0.15 m to 0.75 m, an upper arm 0.11 m to 0.57 m, and a trunk from shoulder to hip
-0.18 m to 0.93 m: wide enough for everybody, narrow enough to refuse most skeletons that two different
-people's rays make.
+40 % because a detector's joints scatter by some centimetres and trunks bend. A thigh may so measure
+0.15 m to 0.75 m, an upper arm 0.11 m to 0.57 m, and a trunk from shoulder to hip 0.18 m to 0.90 m:
+wide enough for everybody, narrow enough to refuse most skeletons that the rays of two different
+people make.
 """
 
 from __future__ import annotations

@@ -22,6 +22,7 @@ Worked number: two people pass at 0.4 m with 1.5 m/s each at 30 Hz. Constant vel
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -129,15 +130,15 @@ class Tracker:
         self._tracks: list[Track] = []
         check_distinct(subjects)
         self._places = [_Place(name=s.name, named=True, start_m=s.start_m) for s in subjects]
-        self._max_subjects = self._options.max_subjects or len(subjects) or None
-        self._next_id = 0
-        self._single = len(rig) == 1
-        if self._max_subjects and self._max_subjects < len(subjects):
+        self._max_subjects = self._options.max_subjects or len(subjects) or sys.maxsize
+        if self._max_subjects < len(subjects):
             raise SessionError(
                 f"max_subjects is {self._max_subjects}, but {len(subjects)} subjects are named"
             )
+        self._next_id = 0
+        self._single = len(rig) == 1
         if self._single:
-            if (self._max_subjects or 1) > 1:
+            if 1 < self._max_subjects < sys.maxsize:
                 raise SessionError(
                     f"one camera cannot tell {self._max_subjects} people apart; "
                     "set max_subjects = 1 or add a camera"
@@ -443,13 +444,12 @@ class Tracker:
         rest = [t for n, t in enumerate(newcomers) if n not in dict(admitted)]
         rest.sort(key=lambda t: (-t.frames, self._from_middle(t)))
         waiting = [p for p in self._places if not (p.live or p.track or p.start_m)]
-        for track in rest:
-            if waiting:
-                self._admit_to(waiting.pop(0), track)
-            elif self._room() > 0:
-                name = self._free_name()
-                self._places.append(_Place(name=name, named=False, start_m=None))
-                self._admit_to(self._places[-1], track)
+        chosen = rest[: len(waiting) + self._room()]
+        for track in sorted(chosen, key=lambda t: t.track_id):
+            if not waiting:
+                waiting.append(_Place(name=self._free_name(), named=False, start_m=None))
+                self._places.append(waiting[0])
+            self._admit_to(waiting.pop(0), track)
 
     def _claim(self, track: Track, place: _Place) -> float:
         """How badly a newcomer fits a waiting or missing subject [m]; infinite: not at all."""
@@ -490,7 +490,7 @@ class Tracker:
                 seen = place.track.seen_ns == now_ns
                 state = TrackState.CONFIRMED if seen else TrackState.COASTING
                 updates.append((place.track, place.name, state))
-        if self._max_subjects is None or len(updates) < self._max_subjects:
+        if len(updates) < self._max_subjects:
             subjects = self._subjects()
             updates += [
                 (track, "", TrackState.TENTATIVE)
@@ -541,8 +541,9 @@ class Tracker:
             middle = np.array([x_min + x_max, z_min + z_max]) / 2
         return float(np.linalg.norm(centre - middle))
 
-    def _room(self) -> float:
-        return np.inf if self._max_subjects is None else self._max_subjects - len(self._places)
+    def _room(self) -> int:
+        """How many more subjects there may be."""
+        return self._max_subjects - len(self._places)
 
     def _free_name(self) -> str:
         taken = {place.name for place in self._places}

@@ -77,9 +77,9 @@ CLIPS = (
     ),
     Clip(
         name="bystander",
-        take="asfamc/03/03_04",
-        start_s=2.0,
-        speed=1.0,
+        take="expmap/train/walking_extra/walking_50",
+        start_s=0.0,
+        speed=0.87,
         heading_deg=0.0,
         centre_m=(-3.0, 0.0),
     ),

@@ -5,6 +5,9 @@ their pixels once into rays (X/Z, Y/Z, confidence), after which no kernel here m
 distortion again. A distance between a 3D skeleton and a detection is metric: the offset on the
 image plane times the depth of the landmark, so that near and far people share one gate.
 
+Missing numbers are asked for with `isnan`: `isfinite` of an expression computes x - x, which
+`fastmath` may reassociate to zero.
+
 `person` (t, c) names for each track and camera a row of the detections, or -1.
 """
 
@@ -39,7 +42,7 @@ def undistort(cameras, camera_of, keypoints, rays_out):
             confidence = keypoints[n, k, 2]
             u = (keypoints[n, k, 0] - cam[_CX]) / cam[_FX]
             v = (keypoints[n, k, 1] - cam[_CY]) / cam[_FY]
-            if not (confidence > 0.0 and math.isfinite(u) and math.isfinite(v)):
+            if not (confidence > 0.0 and -np.inf < u < np.inf and -np.inf < v < np.inf):
                 continue
             x, y = u, v
             if not straight:
@@ -331,7 +334,7 @@ def _triangulate_point(cameras, camera, row, views, scale_px, h, g, points, resi
                         if other < cost:
                             cost = other
                             best[:] = trial
-    if not math.isfinite(cost):
+    if cost == np.inf:
         return np.nan
     for _ in range(4):
         h[:] = 0.0
@@ -405,7 +408,7 @@ def _view_distance(cam, ray, points, truncation_m, min_common):
     common = 0
     for k in range(len(points)):
         w = ray[k, 2]
-        if w > 0.0 and math.isfinite(points[k, 0]):
+        if w > 0.0 and not math.isnan(points[k, 0]):
             x, y, z = _in_camera(cam, points[k])
             d = truncation_m
             if z > 0.0:
@@ -445,9 +448,9 @@ def drop_contradicting_views(
 ):
     """Triangulate each track and set to -1, in place, the views of `person` that disagree.
 
-    While some view is farther than `max_distance_m` from the skeleton, the view whose removal
-    leaves the others in best agreement goes; of two that disagree, the one farther from the
-    prediction, by `prior_m` (t, n).
+    While some view is farther than `max_distance_m` from the skeleton, one goes: of four and more
+    the farthest, for the others outvote it; of three the one without which the other two agree
+    best; of two the one farther from the prediction, by `prior_m` (t, n).
     """
     tracks, views = person.shape
     landmarks = rays.shape[1]
@@ -473,7 +476,7 @@ def drop_contradicting_views(
                         if person[t, c] >= 0 and rays[person[t, c], k, 2] > 0.0:
                             seeing += 1
                     shared += seeing == 2
-                    found += math.isfinite(points_out[t, k, 0])
+                    found += not math.isnan(points_out[t, k, 0])
                 apart = shared >= min_common and found < min_common
             if count < 2 or (farthest <= max_distance_m and not apart):
                 break
@@ -484,19 +487,22 @@ def drop_contradicting_views(
                     continue
                 if count == 2:
                     remaining = -prior_m[t, person[t, c]]
-                else:
+                elif count == 3:
                     trial[:] = person[t]
                     trial[c] = -1
                     triangulate_person(cameras, rays, trial, scale_px, points, error)
-                    remaining = _farthest_view(
-                        cameras, rays, trial, points, truncation_m, min_common
-                    )
                     found = 0
                     for k in range(landmarks):
-                        if math.isfinite(points[k, 0]):
-                            found += 1
-                    if found < min_common:
-                        remaining = truncation_m
+                        found += not math.isnan(points[k, 0])
+                    remaining = truncation_m
+                    if found >= min_common:
+                        remaining = _farthest_view(
+                            cameras, rays, trial, points, truncation_m, min_common
+                        )
+                else:
+                    remaining = -_view_distance(
+                        cameras[c], rays[person[t, c]], points_out[t], truncation_m, min_common
+                    )
                 if remaining < least or out < 0:
                     least = remaining
                     out = c
@@ -517,16 +523,16 @@ def move_tracks(measured, predicted, dt_s, position_gain, velocity_gain, landmar
             known = 0
             for k in range(count):
                 d = measured[t, k, i] - predicted[t, k, i]
-                if math.isfinite(d):
+                if not math.isnan(d):
                     news[known] = d
                     known += 1
             common = np.median(news[:known]) if known else 0.0
             for k in range(count):
                 d = measured[t, k, i] - predicted[t, k, i]
-                moved = predicted[t, k, i] + position_gain * (d if math.isfinite(d) else common)
-                if not math.isfinite(moved):
+                moved = predicted[t, k, i] + position_gain * (common if math.isnan(d) else d)
+                if math.isnan(moved):
                     moved = measured[t, k, i]
-                latest = (moved - landmarks[t, k, i]) / dt_s[t]
-                if math.isfinite(latest):
-                    velocity[t, k, i] += velocity_gain * (latest - velocity[t, k, i])
+                change = moved - landmarks[t, k, i]
+                if dt_s[t] > 0.0 and not math.isnan(change):
+                    velocity[t, k, i] += velocity_gain * (change / dt_s[t] - velocity[t, k, i])
                 landmarks[t, k, i] = moved

@@ -33,6 +33,8 @@ from fusecap.sources.session_data import (
 SAMPLED_INSTANTS = 60
 MAX_DISAGREEMENT_SHARE = 0.01
 """Of the image's diagonal: 22 px of a 1920 x 1080 image."""
+NOTABLE_DISAGREEMENT_SHARE = 0.005
+"""The same of a camera that disagrees twice as much as the others."""
 LOW_COVERAGE = 0.1
 SHIFT_RANGE_S = 1.0
 PEOPLE_HEIGHT_M = (0.7, 2.2)
@@ -328,8 +330,7 @@ def _check_views(
 ) -> None:
     if rig is None or len(tracks) < 2:
         return
-    rig = rig.subset(list(tracks))
-    every = list(tracks.values())
+    rig, every = view_agreement.without_distortion(rig.subset(list(tracks)), list(tracks.values()))
     start = max(float(track.times_s[0]) for track in every)
     end = min(float(track.times_s[-1]) for track in every)
     if start >= end:
@@ -340,9 +341,12 @@ def _check_views(
     times_s = start + np.arange(0, count, step) / fastest_hz
     pairs = view_agreement.disagreement_px(rig, every, times_s)
     own = view_agreement.per_camera_px(pairs)
-    limits = [MAX_DISAGREEMENT_SHARE * np.hypot(*camera.size_px) for camera in rig.cameras]
-    for index in range(len(every)):
-        if own[index] > limits[index]:
+    for index, camera in enumerate(rig.cameras):
+        share = own[index] / np.hypot(*camera.size_px)
+        others = np.delete(own, index)
+        others = others[np.isfinite(others)]
+        outstanding = len(others) > 0 and own[index] > 2 * np.median(others)
+        if share > MAX_DISAGREEMENT_SHARE or (outstanding and share > NOTABLE_DISAGREEMENT_SHARE):
             _report_disagreement(rig, every, index, own[index], times_s, findings)
     _check_people(session, rig, every, times_s, findings)
 

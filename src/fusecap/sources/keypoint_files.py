@@ -24,6 +24,9 @@ from fusecap.errors import InputError
 Progress = Callable[[int, int], None]
 """Called with (done, total)."""
 
+MAX_FRAME = 10**9
+"""Longer numbers are dates or serials."""
+
 _FRAME_NUMBER = re.compile(r"(\d+)(?:_keypoints)?$")
 
 
@@ -101,6 +104,11 @@ def _numbered_files(folder: Path) -> list[tuple[int, str]]:
             if match is None:
                 continue
             number = int(match.group(1))
+            if number >= MAX_FRAME:
+                raise InputError(
+                    f"{entry.path}: frame {number} is out of range; expected a name that ends in "
+                    "the frame's number"
+                )
             if number in by_frame:
                 pair = sorted((os.path.basename(by_frame[number]), entry.name))
                 raise InputError(

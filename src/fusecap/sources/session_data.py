@@ -33,8 +33,8 @@ from fusecap.sources.synchronizer import (
 )
 from fusecap.types import Detections, ImuReading
 
-MAX_INSTANTS = 10_000_000
-"""46 hours at 60 Hz: beyond this, clocks do not agree."""
+MAX_INSTANTS = 2_000_000
+"""9 hours at 60 Hz: beyond this, clocks do not agree."""
 HASHED_BYTES = 1 << 20
 """Of a larger file only name and size enter the hash."""
 

@@ -73,7 +73,8 @@ def _distance_in_heights(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def _extent(people: np.ndarray) -> np.ndarray:
-    span = np.nanmax(people[:, :, :2], axis=1) - np.nanmin(people[:, :, :2], axis=1)
+    xy = people[:, :, :2]
+    span = np.fmax.reduce(xy, axis=1) - np.fmin.reduce(xy, axis=1)
     return span.max(axis=1)
 
 

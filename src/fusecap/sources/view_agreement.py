@@ -9,6 +9,7 @@ of views the people are assigned to each other so that the total distance is lea
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -20,6 +21,22 @@ from fusecap.sources.synchronizer import people_at
 
 MIN_CONFIDENCE = 0.3
 MIN_SHARED_KEYPOINTS = 6
+
+
+def without_distortion(
+    rig: Rig, tracks: Sequence[KeypointTrack]
+) -> tuple[Rig, list[KeypointTrack]]:
+    """The same views through ideal lenses; all functions here are fast on these."""
+    cameras = [replace(camera, distortion=np.zeros(5)) for camera in rig.cameras]
+    ideal = []
+    for camera, track in zip(rig.cameras, tracks, strict=True):
+        everyone = np.concatenate(track.people)
+        flat = camera.undistort(everyone[:, :, :2].reshape(-1, 2))
+        pixels = flat * [camera.matrix[0, 0], camera.matrix[1, 1]] + camera.matrix[:2, 2]
+        everyone = np.concatenate([pixels.reshape(*everyone.shape[:2], 2), everyone[:, :, 2:]], 2)
+        ends = np.cumsum([len(people) for people in track.people])
+        ideal.append(replace(track, people=tuple(np.split(everyone, ends[:-1]))))
+    return Rig(cameras=tuple(cameras)), ideal
 
 
 def pair_distances_px(
@@ -42,9 +59,11 @@ def pair_distances_px(
         in_b = product / np.linalg.norm(lines_in_b[:, :, :2], axis=2)[:, None] * second.matrix[0, 0]
         in_a = product / np.linalg.norm(lines_in_a[:, :, :2], axis=2)[None] * first.matrix[0, 0]
     distance = (in_a + in_b) / 2
-    enough = np.isfinite(distance).sum(2) >= MIN_SHARED_KEYPOINTS
-    cost = np.full(distance.shape[:2], 1e6)
-    cost[enough] = np.nanmedian(distance[enough], axis=1)
+    shared = np.isfinite(distance).sum(2)
+    enough = shared >= MIN_SHARED_KEYPOINTS
+    middle = np.maximum(shared - 1, 0) // 2
+    median = np.take_along_axis(np.sort(distance, axis=2), middle[:, :, None], axis=2)[:, :, 0]
+    cost = np.where(enough, median, 1e6)
     rows, columns = linear_sum_assignment(cost)
     kept = enough[rows, columns]
     rows, columns = rows[kept], columns[kept]

@@ -126,7 +126,7 @@ def _frames(words: list[str], width: int, name: str) -> tuple[Float[np.ndarray, 
     if len(words) < 5 or words[0] != "Frames:" or words[2:4] != ["Frame", "Time:"]:
         raise InputError(f"{name}: expected 'Frames: N' and 'Frame Time: seconds' after MOTION")
     count, frame_time_s = numbers([words[1], words[4]], f"{name}, motion header")
-    if count < 1 or frame_time_s <= 0:
+    if count < 1 or count != int(count) or frame_time_s <= 0:
         raise InputError(f"{name}: {count:g} frames of {frame_time_s:g} s")
     if len(words) - 5 != count * width:
         raise InputError(

@@ -6,7 +6,9 @@ dropped. The file has no bone lengths; the tree carries those of one adult of th
 
 The root was converted with its angles in another order than every other joint: where the same take
 exists as BVH, its rotation is Rz Ry Rx, and the exponential map is that of Rz Rx Ry with the same
-three angles. They are taken out and put together again as BVH has them, with |y| <= 90 degrees.
+three angles. They are taken out and put together again as BVH has them. Three angles have a second
+reading, (z + 180, 180 - x, y + 180) degrees, which turns the other way: the take opens with the one
+that has |y| <= 90 degrees and goes on with whichever continues its motion.
 """
 
 from __future__ import annotations
@@ -96,7 +98,20 @@ def parse_expmap(text: str, name: str) -> Motion:
 def _root_as_in_bvh(rotation: Float[np.ndarray, "t 3 3"]) -> Float[np.ndarray, "t 3 3"]:
     """Rz Ry Rx from Rz Rx Ry of the same angles."""
     z, x, y = Rotation.from_matrix(rotation).as_euler("ZXY").T
-    other = np.abs(y) > np.pi / 2
-    z, y = (np.where(other, angle + np.pi, angle) for angle in (z, y))
-    x = np.where(other, np.pi - x, x)
-    return Rotation.from_euler("ZYX", np.stack([z, y, x], axis=1)).as_matrix()
+    readings = np.stack(
+        [
+            Rotation.from_euler("ZYX", np.stack(angles, axis=1)).as_quat()
+            for angles in ((z, y, x), (z + np.pi, y + np.pi, np.pi - x))
+        ],
+        axis=1,
+    )
+    chosen = readings[:, 0].copy()
+    if abs(y[0]) > np.pi / 2:
+        chosen[0] = readings[0, 1]
+    expected = chosen[0]
+    for frame in range(1, len(chosen)):
+        along = readings[frame] @ expected
+        best = int(np.argmax(np.abs(along)))
+        chosen[frame] = readings[frame, best] * (-1.0 if along[best] < 0 else 1.0)
+        expected = 2 * chosen[frame] - chosen[frame - 1]
+    return Rotation.from_quat(chosen).as_matrix()

@@ -30,7 +30,10 @@ def numbers(value: Any, shape: tuple[int, ...], where: str) -> np.ndarray:
 
 def distortion(value: Any, where: str) -> np.ndarray:
     """k1, k2, p1, p2, k3 from 0, 4 or 5 numbers, or more whose rest is zero."""
-    values = np.asarray(value if value is not None else [], dtype=np.float64).ravel()
+    try:
+        values = np.asarray(value if value is not None else [], dtype=np.float64).ravel()
+    except (TypeError, ValueError):
+        raise CalibrationError(f"{where}: found {_short(value)}, expected 4 or 5 numbers") from None
     if values.size not in (0, 4, 5, 8, 12, 14) or np.any(values[5:] != 0):
         raise CalibrationError(
             f"{where}: found {values.size} distortion coefficients, expected 4 or 5 "

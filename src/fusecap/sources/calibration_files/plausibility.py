@@ -38,6 +38,18 @@ def check_rig(rig: Rig, *, floor: bool = True) -> list[Finding]:
                         remedy="calibrate the extrinsics again",
                     )
                 )
+    for camera in rig.cameras:
+        centre = camera.matrix[:2, 2] / camera.size_px
+        if np.any(centre < 0.1) or np.any(centre > 0.9):
+            findings.append(
+                Finding(
+                    severity="warning",
+                    where=f"camera '{camera.name}'",
+                    found=f"its optical axis meets the image at {camera.matrix[0, 2]:.0f}, "
+                    f"{camera.matrix[1, 2]:.0f} px of {camera.size_px[0]} x {camera.size_px[1]}",
+                    remedy="check that size and matrix belong to the same resolution",
+                )
+            )
     if len(rig) == 0:
         return findings
     down = np.array([camera.rotation[1] for camera in rig.cameras])

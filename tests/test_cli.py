@@ -1,0 +1,170 @@
+"""The command line as its user meets it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fusecap.evaluate.demo_scene import demo_scene
+from fusecap.evaluate.simulated_session import write_session
+from fusecap.sinks.take import load_take
+
+
+def fusecap(*arguments: object, **options) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "fusecap", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, **options)
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory) -> Path:
+    """Two seconds of the demo scene as a session folder."""
+    folder = tmp_path_factory.mktemp("session")
+    write_session(demo_scene(0, seconds=2.0), folder)
+    return folder
+
+
+@pytest.mark.parametrize(
+    "command",
+    [(), ("demo",), ("solve",), ("export",), ("doctor",), ("calibrate",), ("calibrate", "prior")],
+)
+def test_help_shows_usage_and_an_example(command):
+    result = fusecap(*command, "--help")
+    assert result.returncode == 0
+    assert "Usage" in result.stdout
+    if len(command) != 0 and command != ("calibrate",):
+        assert "Example: fusecap" in result.stdout
+
+
+def test_demo_reports_errors_and_speed_and_writes_files(tmp_path):
+    result = fusecap("demo", "--seconds", 3, "--out", tmp_path, "--json")
+    assert result.returncode == 0, result.stderr
+    report = json.loads(result.stdout)
+    assert report["simulated"] is True
+    assert 0 < report["position_error_mm"] < 60
+    assert 0 < report["orientation_error_deg"] < 25
+    assert report["subjects"] == 2
+    assert report["identity_switches"] == 0
+    assert 0 < report["solve_ms_median"] <= report["solve_ms_p99"]
+    take = load_take(tmp_path / "demo.npz")
+    assert take.tracked.all()
+    assert {path.suffix for path in tmp_path.iterdir()} == {".npz", ".bvh", ".png"}
+
+
+def test_solve_writes_the_take_and_reports_in_json(session, tmp_path):
+    out = tmp_path / "nested" / "take.npz"
+    result = fusecap("solve", session, "--out", out, "--export", "bvh", "--json")
+    assert result.returncode == 0, result.stderr
+    report = json.loads(result.stdout)
+    assert report["instants"] == 120
+    assert set(report["subjects"]) == {"anna", "ben"}
+    assert all(subject["tracked_share"] > 0.95 for subject in report["subjects"].values())
+    assert all(camera["median"] < 20 for camera in report["reprojection_px"].values())
+    assert report["solves"] > 200
+    with np.load(out, allow_pickle=False) as arrays:
+        assert arrays["theta"].shape == (2, 120, 66)
+    assert sorted(path.name for path in out.parent.glob("*.bvh")) == [
+        "take_anna.bvh",
+        "take_ben.bvh",
+    ]
+
+
+def test_a_session_solves_to_the_same_bits_each_time(session, tmp_path):
+    for name in ("a", "b"):
+        assert fusecap("solve", session, "--out", tmp_path / f"{name}.npz").returncode == 0
+    first, second = load_take(tmp_path / "a.npz"), load_take(tmp_path / "b.npz")
+    np.testing.assert_array_equal(first.theta, second.theta)
+
+
+def test_export_writes_one_bvh_per_person(session, tmp_path):
+    take = tmp_path / "take.npz"
+    assert fusecap("solve", session, "--out", take).returncode == 0
+    result = fusecap("export", take, "--format", "bvh", "--unit", "cm", "--out", tmp_path / "x")
+    assert result.returncode == 0, result.stderr
+    assert len(list((tmp_path / "x").glob("*.bvh"))) == 2
+
+
+def test_doctor_finds_nothing_wrong_with_a_good_session(session):
+    result = fusecap("doctor", session, "--json")
+    assert result.returncode == 0, result.stdout
+    assert json.loads(result.stdout)["errors"] == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (("solve", "nowhere"), 1, "nowhere"),
+        (("solve",), 2, "Missing argument"),
+        (("solve", ".", "--export", "fbx"), 2, "fbx"),
+        (("demo", "--associate", "papr"), 2, "did you mean 'paper'"),
+        (("demo", "--seconds", "1000"), 1, "1000 s asked for"),
+        (("export", "nowhere.npz"), 1, "nowhere.npz"),
+        (("export", "nowhere.npz", "--format", "bhv"), 2, "bvh"),
+        (("frobnicate",), 2, "frobnicate"),
+        (("calibrate", "prior", "nowhere"), 1, "nowhere"),
+        (("calibrate", "prior", ".", "--skeleton", "paper2"), 1, "paper21"),
+    ],
+)
+def test_misuse_is_explained_without_a_traceback(arguments, code, message, tmp_path):
+    result = fusecap(*arguments, cwd=tmp_path)
+    assert result.returncode == code
+    assert message in " ".join(result.stderr.split())
+    assert "Traceback" not in result.stderr
+
+
+def test_with_json_a_failure_is_json_too(tmp_path):
+    result = fusecap("solve", tmp_path / "nowhere", "--json")
+    assert result.returncode == 1
+    assert "nowhere" in json.loads(result.stdout)["error"]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name == "nt", reason="signals")
+def test_ctrl_c_leaves_a_valid_take_of_what_was_solved(tmp_path):
+    write_session(demo_scene(0), tmp_path)
+    out = tmp_path / "take.npz"
+    process = subprocess.Popen(
+        [sys.executable, "-c", _SLOW_SOLVE, str(tmp_path), str(out)],
+        stderr=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    while "sorting 100" not in process.stdout.readline():
+        time.sleep(0)
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=60)
+    take = load_take(out)
+    assert 90 <= len(take.timestamps_ns) < 720
+    assert take.tracked.any()
+
+
+_SLOW_SOLVE = """
+import sys
+from fusecap.offline import solve_session
+from fusecap.sinks.take import save_take
+from fusecap.sources.session import load_session
+from fusecap.sources.session_data import open_session
+
+def show(what, done, total):
+    print(what, done, flush=True)
+
+solved = solve_session(open_session(load_session(sys.argv[1])), progress=show)
+save_take(solved.take, sys.argv[2])
+"""
+
+
+def test_import_and_help_load_no_heavy_package():
+    for code in ("import fusecap", "import fusecap.cli"):
+        check = f"{code}; import sys; print({{'numba', 'scipy', 'matplotlib'}} & {{*sys.modules}})"
+        result = subprocess.run(
+            [sys.executable, "-c", check], capture_output=True, text=True, check=True
+        )
+        assert result.stdout.strip() == "set()"
