@@ -56,7 +56,6 @@ def find_candidates(
     views: Views,
     free: np.ndarray,
     anatomy: Anatomy,
-    mirror: np.ndarray,
     options: CandidateOptions,
 ) -> list[Candidate]:
     """People among the free detections (n,), best supported first; each detection at most once."""
@@ -68,7 +67,7 @@ def find_candidates(
     if len(pairs) == 0:
         return []
 
-    distance, _ = views.distances(points, mirror, 2 * options.support_m, free)
+    distance = views.distances(points, 2 * options.support_m, free)
     support = np.clip(1 - distance / options.support_m, 0, None)
     filled = [c for c in range(len(views.first) - 1) if views.first[c] < views.first[c + 1]]
     starts = [views.first[c] for c in filled]

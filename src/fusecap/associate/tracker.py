@@ -210,8 +210,10 @@ class Tracker:
     def _distance(self, views: Views, landmarks: np.ndarray, wanted: np.ndarray) -> np.ndarray:
         """Distance [m] (t, n) of tracks to detections, right way round or mirrored."""
         truncation_m = 2 * self._options.gate_m
-        direct, mirrored = views.distances(landmarks, self._mirror, truncation_m, wanted)
-        return np.minimum(direct, mirrored + self._options.mirror_penalty_m)
+        plain = views.distances(landmarks, truncation_m, wanted)
+        other_way = np.ascontiguousarray(landmarks[:, self._mirror])
+        mirrored = views.distances(other_way, truncation_m, wanted)
+        return np.minimum(plain, mirrored + self._options.mirror_penalty_m)
 
     def _check(
         self, views: Views, person: np.ndarray, distance: np.ndarray, free: np.ndarray
@@ -298,7 +300,7 @@ class Tracker:
         free[alone] = True
         if len(np.unique(views.camera_of[free])) < 2:
             return person, measured
-        found = find_candidates(views, free, self._anatomy, self._mirror, o.candidates)
+        found = find_candidates(views, free, self._anatomy, o.candidates)
         if not found:
             return person, measured
         taken = set()

@@ -46,24 +46,21 @@ class Views:
         return np.where(person >= 0, person - np.array(self.first[:-1]), -1)
 
     def distances(
-        self, landmarks: np.ndarray, mirror: np.ndarray, truncation_m: float, wanted: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Distances [m] (t, n) of skeletons (t, k, 3) to the wanted detections; and mirrored."""
-        direct = np.empty((len(landmarks), len(self.rays)))
-        mirrored = np.empty_like(direct)
+        self, landmarks: np.ndarray, truncation_m: float, wanted: np.ndarray
+    ) -> np.ndarray:
+        """Distances [m] (t, n) of skeletons (t, k, 3) to the wanted detections; others infinite."""
+        distance = np.empty((len(landmarks), len(self.rays)))
         kernels.match_distance(
             self.cameras,
             self.camera_of,
             self.rays,
             wanted,
             landmarks,
-            mirror,
             truncation_m,
             MIN_COMMON,
-            direct,
-            mirrored,
+            distance,
         )
-        return direct, mirrored
+        return distance
 
     def triangulate(
         self, person: np.ndarray, prior_m: np.ndarray, max_distance_m: float, scale_px: float

@@ -76,23 +76,18 @@ def _in_camera(cam, point):
     )
 
 
-@kernel(
-    "void(f8[:, ::1], i8[::1], f8[:, :, ::1], b1[::1], f8[:, :, ::1], i8[::1], f8, i8, "
-    "f8[:, ::1], f8[:, ::1])"
-)
+@kernel("void(f8[:, ::1], i8[::1], f8[:, :, ::1], b1[::1], f8[:, :, ::1], f8, i8, f8[:, ::1])")
 def match_distance(
     cameras,
     camera_of,
     rays,
     wanted,
     points_in_world,
-    mirror,
     truncation_m,
     min_common,
     distance_out,
-    mirrored_out,
 ):
-    """Mean distance [m] (t, n) of each skeleton to each detection, and to it mirrored.
+    """Mean distance [m] (t, n) of each skeleton to each detection.
 
     Weighted by confidence, each landmark's distance truncated; infinite where fewer than
     `min_common` landmarks are known in both, and for detections (n,) that are not `wanted`.
@@ -104,7 +99,6 @@ def match_distance(
         for n in range(len(rays)):
             if not wanted[n]:
                 distance_out[t, n] = np.inf
-                mirrored_out[t, n] = np.inf
                 continue
             camera = camera_of[n]
             if camera != last:
@@ -114,32 +108,17 @@ def match_distance(
                     projected[k, 0] = x / z
                     projected[k, 1] = y / z
                     projected[k, 2] = z if z > 0.0 else np.nan
-            weight = total = weight_mirrored = total_mirrored = 0.0
+            total = weight = 0.0
             common = 0
             for k in range(landmarks):
                 z = projected[k, 2]
-                if math.isnan(z):
-                    continue
                 w = rays[n, k, 2]
-                if w > 0.0:
-                    d = z * _length(
-                        rays[n, k, 0] - projected[k, 0], rays[n, k, 1] - projected[k, 1]
-                    )
-                    total += w * min(d, truncation_m)
+                if w > 0.0 and not math.isnan(z):
+                    dx, dy = rays[n, k, 0] - projected[k, 0], rays[n, k, 1] - projected[k, 1]
+                    total += w * min(z * _length(dx, dy), truncation_m)
                     weight += w
                     common += 1
-                m = mirror[k]
-                w = rays[n, m, 2]
-                if w > 0.0:
-                    d = z * _length(
-                        rays[n, m, 0] - projected[k, 0], rays[n, m, 1] - projected[k, 1]
-                    )
-                    total_mirrored += w * min(d, truncation_m)
-                    weight_mirrored += w
             distance_out[t, n] = total / weight if common >= min_common else np.inf
-            mirrored_out[t, n] = (
-                total_mirrored / weight_mirrored if common >= min_common else np.inf
-            )
 
 
 @kernel("void(f8[:, ::1], i8[::1], f8[:, :, ::1], i8[:, ::1], f8, i8, f8[:, :, ::1], f8[::1])")
@@ -336,7 +315,7 @@ def _triangulate_point(cameras, camera, row, views, scale_px, h, g, points, resi
                             best[:] = trial
     if cost == np.inf:
         return np.nan
-    for _ in range(4):
+    for _ in range(10):
         h[:] = 0.0
         g[:] = 0.0
         for v in range(views):
