@@ -381,10 +381,8 @@ def test_misuse_says_what_to_do(make, message):
 
 def test_algorithm_1_sorts_two_who_keep_apart(rng):
     rig = ring_of_cameras(4)
-    subjects = [
-        Subject(name="ann", start_m=(-3.0, 0.75)),
-        Subject(name="bob", start_m=(3.0, -0.75)),
-    ]
+    ann = Subject(name="ann", start_m=(-3.0, 0.75))
+    bob = Subject(name="bob", start_m=(3.0, -0.75))
     scene = observe(rig, two_who_pass(1.5), rng)
     history, score = run(PaperSorter(rig, BODY25, [ann, bob]), scene)
     assert score.person_of == {0: 0, 1: 1}

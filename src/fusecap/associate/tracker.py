@@ -41,6 +41,9 @@ from fusecap.errors import SessionError
 from fusecap.geometry.camera import Rig
 from fusecap.types import Detections, TrackState, TrackUpdate
 
+TRUNCATION = 2.0
+"""No landmark counts as farther than so many gates: half a body may be wild before the mean is."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackerOptions:
@@ -195,9 +198,10 @@ class Tracker:
             assign_each_view(distance, gate, views.camera_of, views.first, free, person)
         measured = self._check(views, person, distance, free)
 
-        if free.any():
+        near = free & (distance < TRUNCATION * o.gate_m).any(axis=0)
+        if near.any():
             current = np.where(np.isnan(measured), expected, measured)
-            again = self._distance(views, current, free)
+            again = self._distance(views, current, near)
             tight = np.full(len(current), o.candidates.consistency_m)
             before = person.copy()
             assign_each_view(again, tight, views.camera_of, views.first, free, person)
@@ -209,7 +213,7 @@ class Tracker:
 
     def _distance(self, views: Views, landmarks: np.ndarray, wanted: np.ndarray) -> np.ndarray:
         """Distance [m] (t, n) of tracks to detections, right way round or mirrored."""
-        truncation_m = 2 * self._options.gate_m
+        truncation_m = TRUNCATION * self._options.gate_m
         plain = views.distances(landmarks, truncation_m, wanted)
         other_way = np.ascontiguousarray(landmarks[:, self._mirror])
         mirrored = views.distances(other_way, truncation_m, wanted)
@@ -259,9 +263,10 @@ class Tracker:
     def _count_frame(self, track: Track, views: int, now_ns: int) -> None:
         track.triangulated_ns = now_ns
         track.frames += 1
+        enough = self._options.birth_views
         if track.strong_frames < self._options.birth_frames:
-            needed = min(self._options.birth_views, self._cameras_that_see(track.landmarks))
-            track.strong_frames += views >= needed
+            strong = views >= enough or views >= self._cameras_that_see(track.landmarks)
+            track.strong_frames += strong
 
     def _at_depth(self, camera: int, ray: np.ndarray, landmarks: np.ndarray) -> np.ndarray:
         """Where one view puts landmarks (k, 3) if their depth has not changed; NaN where unseen."""

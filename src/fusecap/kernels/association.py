@@ -53,7 +53,7 @@ def undistort(cameras, camera_of, keypoints, rays_out):
                     dy = v - (y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y)
                     x += dx
                     y += dy
-                    if dx * dx + dy * dy < 1e-16:
+                    if dx * dx + dy * dy < 1e-14:
                         break
                 if not x * x + y * y <= cam[_MAX_R2]:
                     continue
@@ -333,7 +333,7 @@ def _triangulate_point(cameras, camera, row, views, scale_px, h, g, points, resi
         if not _solve3(h, g, trial):
             return np.nan
         best += trial
-        if trial[0] ** 2 + trial[1] ** 2 + trial[2] ** 2 < 1e-8:
+        if trial[0] ** 2 + trial[1] ** 2 + trial[2] ** 2 < 1e-6:
             break
     _residuals(cameras, camera, row, views, scale_px, best, residual_px)
     inliers = 0
