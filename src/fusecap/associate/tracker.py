@@ -45,6 +45,10 @@ TRUNCATION = 2.0
 """No landmark counts as farther than so many gates: half a body may be wild before the mean is."""
 
 
+_HIP_HEIGHT_M = 0.9
+"""Of an adult, where only a start position on the floor is known."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackerOptions:
     """Chosen from anatomy, human speed and detector noise; none from a recording."""
@@ -198,7 +202,8 @@ class Tracker:
             assign_each_view(distance, gate, views.camera_of, views.first, free, person)
         measured = self._check(views, person, distance, free)
 
-        near = free & (distance < TRUNCATION * o.gate_m).any(axis=0)
+        # Only what was not far from a prediction can be near the skeleton just measured.
+        near = free & (distance < 1.5 * o.gate_m).any(axis=0)
         if near.any():
             current = np.where(np.isnan(measured), expected, measured)
             again = self._distance(views, current, near)
@@ -366,11 +371,17 @@ class Tracker:
         expected: np.ndarray,
         now_ns: int,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """With one camera the subject is the most confident detection, at first and once lost."""
+        """With one camera the subject is the detection at the start position, or the surest one."""
         confidence = views.rays[:, :, 2].sum(axis=1)
         if not confidence.any():
             return person, measured
+        chosen = int(np.argmax(confidence))
         if not self._tracks:
+            start_m = self._places[0].start_m if self._places else None
+            if start_m is not None:
+                chosen = self._nearest_in_view(views, start_m)
+                if chosen < 0:
+                    return person, measured
             unknown = np.full(views.rays.shape[1:], np.nan)
             track = self._begin(unknown, now_ns)
             track.frames = track.strong_frames = self._options.birth_frames
@@ -381,8 +392,19 @@ class Tracker:
             if lost_s <= self._options.tentative_s and np.isfinite(expected).any():
                 return person, measured
             track.restart(np.full_like(track.landmarks, np.nan), now_ns)
-        person[0, 0] = int(np.argmax(confidence))
+        person[0, 0] = chosen
         return person, measured
+
+    def _nearest_in_view(self, views: Views, start_m: tuple[float, float]) -> int:
+        """The detection of the only camera nearest to a person at `start_m`; -1 if none is near."""
+        camera = self._rig.cameras[0]
+        hips = camera.rotation @ [start_m[0], _HIP_HEIGHT_M, start_m[1]] + camera.translation
+        weight = views.rays[:, :, 2:]
+        middle = (np.nan_to_num(views.rays[:, :, :2]) * weight).sum(axis=1)
+        middle /= np.maximum(weight.sum(axis=1), 1e-9)
+        away_m = np.linalg.norm(middle * hips[2] - hips[:2], axis=1)
+        nearest = int(np.argmin(away_m))
+        return nearest if away_m[nearest] < self._options.start_radius_m else -1
 
     # ------------------------------------------------------------------------------ forget, admit
 
@@ -465,7 +487,9 @@ class Tracker:
         if place.track is None:
             assert place.start_m is not None
             away = float(np.hypot(centre[0] - place.start_m[0], centre[2] - place.start_m[1]))
-            return away if away < o.start_radius_m or self._single else np.inf
+            if self._single:
+                return 0.0  # One camera gives no place to compare with.
+            return away if away < o.start_radius_m else np.inf
         lost = place.track
         if track.born_ns <= lost.seen_ns:
             return np.inf  # Both were seen at once: two people.
