@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -116,6 +118,22 @@ def test_assignment_is_optimal_and_respects_gates():
     # Greedy would give track 0 the first detection and leave track 1 with nothing.
     np.testing.assert_array_equal(person, [[1, 2], [0, -1]])
     assert not free.any()
+
+
+def test_assignment_has_the_least_total_of_all(rng):
+    for _ in range(50):
+        distance = rng.uniform(0, 1, (3, 4))
+        gate = np.full(3, 0.5)
+        person = np.full((3, 1), -1)
+        free = np.ones(4, dtype=bool)
+        assign_each_view(distance, gate, np.zeros(4, dtype=int), (0, 4), free, person)
+        cost = np.minimum(distance, 0.5)
+        least = min(
+            sum(cost[t, n] for t, n in enumerate(order))
+            for order in itertools.permutations(range(4), 3)
+        )
+        total = sum(cost[t, n] if n >= 0 else 0.5 for t, n in enumerate(person[:, 0]))
+        assert total == pytest.approx(least)
 
 
 # -------------------------------------------------------------------------------------- candidates

@@ -113,7 +113,7 @@ class Pipeline:
         return Estimator(
             model,
             rig=self._rig,
-            landmarks=self._landmarks,
+            landmarks=self._landmarks.of(model.name),
             prior=self._prior,
             skeleton=self._skeleton,
             options=self._options,

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from fusecap.kernels import association as kernels
+
 
 def assign_each_view(
     distance_m: np.ndarray,
@@ -19,15 +21,8 @@ def assign_each_view(
     `distance_m` is (t, n), `free` (n,) loses the detections given away. A pair beyond the gate
     costs as much as the gate, so leaving a track without a detection is never dearer than that.
     """
-    near = (distance_m < gate_m[:, None]) & free & (person < 0)[:, camera_of]
-    # A pair that nobody else is near to needs no search.
-    in_view = near @ np.equal.outer(camera_of, np.arange(person.shape[1])).astype(np.float64)
-    alone = near & (near.sum(axis=0) == 1) & (in_view[:, camera_of] == 1)
-    tracks, people = np.nonzero(alone)
-    person[tracks, camera_of[people]] = people
-    free[people] = False
-    near ^= alone
-    if not near.any():
+    near = np.empty(distance_m.shape, dtype=bool)
+    if not kernels.assign_undisputed(distance_m, gate_m, camera_of, free, person, near):
         return
     cost = np.where(near, distance_m, gate_m[:, None])
     for c in np.flatnonzero(np.bincount(camera_of[near.any(axis=0)])):

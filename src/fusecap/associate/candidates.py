@@ -62,6 +62,8 @@ def find_candidates(
     pairs = _pairs_of_views(views, free)
     points, error = triangulate_pairs(views, pairs, options.max_error_px)
     good = np.isfinite(error)
+    if not good.any():
+        return []
     good[good] = anatomy.possible(points[good])
     pairs, points = pairs[good], np.ascontiguousarray(points[good])
     if len(pairs) == 0:
@@ -111,6 +113,6 @@ def triangulate_pairs(
 def _pairs_of_views(views: Views, free: np.ndarray) -> np.ndarray:
     """All pairs (h, 2) of free detections in two different views."""
     rows = np.flatnonzero(free)
-    a, b = np.triu_indices(len(rows), 1)
-    pairs = np.stack([rows[a], rows[b]], axis=1)
-    return pairs[views.camera_of[pairs[:, 0]] != views.camera_of[pairs[:, 1]]]
+    camera_of = views.camera_of[rows]
+    a, b = np.nonzero(np.less.outer(camera_of, camera_of))
+    return np.stack([rows[a], rows[b]], axis=1)

@@ -39,6 +39,7 @@ from fusecap.associate.views import MIN_COMMON, Views
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.errors import SessionError
 from fusecap.geometry.camera import Rig
+from fusecap.kernels import association as kernels
 from fusecap.types import Detections, TrackState, TrackUpdate
 
 TRUNCATION = 2.0
@@ -440,7 +441,8 @@ class Tracker:
             if track.triangulated_ns == now_ns and track in alive
         ]
         order = [r for *_, r in sorted(seen)]
-        same = _coincide(measured[order], self._options.duplicate_m / 2)
+        same = np.empty((len(order), len(order)), dtype=bool)
+        kernels.coincide(measured[order], self._options.duplicate_m / 2, MIN_COMMON, same)
         doubled = []
         for place, r in enumerate(order):
             track = self._tracks[r]
@@ -589,14 +591,6 @@ def _apart(a: np.ndarray, b: np.ndarray, mirror: np.ndarray) -> float:
     distance = np.fmin(np.linalg.norm(a - b, axis=1), np.linalg.norm(a - b[mirror], axis=1))
     distance = distance[np.isfinite(distance)]
     return float(np.median(distance)) if len(distance) >= MIN_COMMON else np.inf
-
-
-def _coincide(landmarks: np.ndarray, limit_m: float) -> np.ndarray:
-    """Which skeletons of (t, k, 3) have most of their common landmarks within the limit (t, t)."""
-    apart = landmarks[:, None] - landmarks[None]
-    squared = np.einsum("abki,abki->abk", apart, apart)
-    common = np.isfinite(squared).sum(axis=2)
-    return ((squared < limit_m**2).sum(axis=2) > common / 2) & (common >= MIN_COMMON)
 
 
 def _misfit(a: np.ndarray, b: np.ndarray) -> float:

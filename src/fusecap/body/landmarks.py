@@ -5,12 +5,14 @@ the bone's frame (x left, y up, z forward in the rest pose), so one table serves
 keypoints sit on the joint centres; those of the head, trunk and feet follow the adult head and foot
 breadths and heights of Winter, "Biomechanics and Motor Control of Human Movement", fig. 4.1, and
 NASA-STD-3000 vol. 1, sec. 3 (tragion, eye and nose against the top of the neck). They are starting
-values without any detector's bias; eq. 17-18 of the paper calibrate them to a detector.
+values without any detector's bias; eq. 17-18 of the paper calibrate them to a detector, and a set
+that was `calibrated` carries the result to whoever asks it for offsets.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -55,12 +57,37 @@ LANDMARKS = _all_landmarks()
 """Landmark name to (bone, offset in the bone's frame as a fraction of stature)."""
 
 
+Offset = tuple[float, float, float]
+"""In the bone's frame (x left, y up, z forward in the rest pose), as fractions of stature."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LandmarkOffsets:
+    """Calibrated places of landmarks on their bones [1, eq. 18]; the others keep their defaults."""
+
+    everyone: Mapping[str, Offset] = field(default_factory=dict)
+    subjects: Mapping[str, Mapping[str, Offset]] = field(default_factory=dict)
+    """By subject name; comes before `everyone`."""
+
+    def __post_init__(self) -> None:
+        for offsets in (self.everyone, *self.subjects.values()):
+            for name in offsets:
+                if name not in LANDMARKS:
+                    raise InputError(f"no landmark '{name}'{nearest(name, LANDMARKS)}")
+
+    def of(self, subject: str) -> LandmarkOffsets:
+        """Those of one subject, as the offsets of everyone."""
+        return LandmarkOffsets(everyone={**self.everyone, **self.subjects.get(subject, {})})
+
+
 @dataclass(frozen=True, kw_only=True)
 class LandmarkSet:
-    """The landmarks of one detector, in the order of its keypoints."""
+    """The landmarks of one detector, in the order of its keypoints, and where they lie."""
 
     name: str
     landmark_names: tuple[str, ...]
+    offsets: LandmarkOffsets | None = field(default=None, hash=False)
+    """Calibrated; None: the defaults of `LANDMARKS`."""
 
     def index(self, name: str) -> int | None:
         """Position of a landmark, or None where this detector does not have it."""
@@ -82,9 +109,25 @@ class LandmarkSet:
             [skeleton.bone(LANDMARKS[name][0]) for name in self.landmark_names], dtype=np.int64
         )
 
+    @cached_property
+    def fractions(self) -> Float[np.ndarray, "k 3"]:
+        """Offsets t_pb of eq. 5 in the bones' frames, calibrated or default, by stature."""
+        calibrated = self.offsets.everyone if self.offsets else {}
+        return np.array([calibrated.get(name, LANDMARKS[name][1]) for name in self.landmark_names])
+
     def offsets_m(self, shape: BodyShape) -> Float[np.ndarray, "k 3"]:
-        """Default offsets t_pb of eq. 5, in the bones' frames [m], for a body of this stature."""
-        return np.array([LANDMARKS[name][1] for name in self.landmark_names]) * shape.height_m
+        """Offsets t_pb of eq. 5, in the bones' frames [m], for a body of this stature."""
+        return self.fractions * shape.height_m
+
+    def calibrated(self, offsets: LandmarkOffsets | None) -> LandmarkSet:
+        """The same landmarks at calibrated places; None: at the default ones."""
+        return replace(self, offsets=offsets)
+
+    def of(self, subject: str) -> LandmarkSet:
+        """The landmarks as they lie on one subject."""
+        if self.offsets is None or subject not in self.offsets.subjects:
+            return self
+        return self.calibrated(self.offsets.of(subject))
 
 
 _COCO = (

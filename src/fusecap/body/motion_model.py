@@ -1,4 +1,4 @@
-"""The motion that ships: three people for twelve seconds, as truncated cosine series.
+"""The motion that ships, as truncated cosine series: the demo's three people, the twin's takes.
 
 Root positions and the components of sign-continuous quaternions are smooth in time, so 8 Hz of
 cosines carry them:
@@ -20,29 +20,40 @@ from scipy.spatial.transform import Rotation
 from fusecap.errors import InputError
 
 
-class DemoMotion(NamedTuple):
-    """S people over T frames, for skeleton `paper21` at 1.75 m."""
+class ShippedMotion(NamedTuple):
+    """S clips over T frames, for skeleton `paper21` at 1.75 m."""
 
     names: tuple[str, ...]
-    """The subjects first, the bystander last."""
+    takes: tuple[str, ...]
+    """Of the CMU archives, keys of `MotionFolder`."""
     rate_hz: float
     theta: Float[np.ndarray, "s t 66"]
-    """Angles at most pi; within a 4 x 4 m area round the origin but for the bystander."""
+    """Angles at most pi."""
 
 
-def load_demo_motion() -> DemoMotion:
-    """The motion in `fusecap.data`; raises `InputError` where it is missing."""
-    source = resources.files("fusecap.data") / "demo_motion.npz"
+def load_demo_motion() -> ShippedMotion:
+    """The subjects, then the bystander; all but it within 4 x 4 m round the origin."""
+    return _load("demo_motion.npz")
+
+
+def load_twin_motion() -> ShippedMotion:
+    """Every clip of the twin, each with the middle of its path over the origin."""
+    return _load("twin_motion.npz")
+
+
+def _load(name: str) -> ShippedMotion:
+    source = resources.files("fusecap.data") / name
     if not source.is_file():
-        raise InputError(f"no demo motion at {source}; the installation is incomplete")
+        raise InputError(f"no motion at {source}; the installation is incomplete")
     with source.open("rb") as file, np.load(file, allow_pickle=False) as stored:
         names = tuple(str(name) for name in stored["names"])
+        takes = tuple(str(take) for take in stored["takes"])
         rate_hz = float(stored["rate_hz"])
         time_s = float(stored["start_s"]) + np.arange(int(stored["frames"])) / rate_hz
         coefficients = stored["coefficients"].astype(np.float64)
         interval_s = float(stored["interval_s"])
     channels = np.stack([evaluate_series(c, interval_s, time_s) for c in coefficients])
-    return DemoMotion(names=names, rate_hz=rate_hz, theta=theta_of_channels(channels))
+    return ShippedMotion(names=names, takes=takes, rate_hz=rate_hz, theta=theta_of_channels(channels))
 
 
 def evaluate_series(

@@ -8,12 +8,14 @@ the bone's rotation and acceleration with all of these errors in them.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from fusecap.body.pose import forward_kinematics
 from fusecap.body.shape import BodyShape, end_offsets_m
 from fusecap.evaluate.noise import correlated_noise
 from fusecap.sources.imu_files.track import GRAVITY_M_S2
@@ -82,6 +84,17 @@ class SimulatedImus:
     """As the calibration believes it."""
     position_in_bone_m: Float[np.ndarray, "i 3"]
 
+    def subset(self, bones: Sequence[str]) -> SimulatedImus:
+        """The sensors on the named bones, in the order they are in."""
+        kept = [index for index, bone in enumerate(self.bones) if bone in bones]
+        return SimulatedImus(
+            bones=tuple(self.bones[index] for index in kept),
+            world_from_imu=self.world_from_imu[:, kept],
+            accel_m_s2=self.accel_m_s2[:, kept],
+            bone_from_imu=self.bone_from_imu[kept],
+            position_in_bone_m=self.position_in_bone_m[kept],
+        )
+
     def readings(self) -> tuple[ImuReading, ...]:
         """What the solver is given, per frame [1, eq. 8, 12]."""
         rotation = self.world_from_imu @ np.swapaxes(self.bone_from_imu, 1, 2)
@@ -96,14 +109,14 @@ class SimulatedImus:
 def measure(
     rng: np.random.Generator,
     shape: BodyShape,
-    position_in_world_m: Float[np.ndarray, "t b 3"],
-    rotation_in_world: Float[np.ndarray, "t b 3 3"],
+    theta: Float[np.ndarray, "t p"],
     bones: tuple[str, ...],
     noise: ImuNoise,
     rate_hz: float,
 ) -> SimulatedImus:
     """Sensors half-way along `bones`, mounted any way round."""
-    frames, count = len(position_in_world_m), len(bones)
+    position_in_world_m, rotation_in_world = forward_kinematics(shape, theta)
+    frames, count = len(theta), len(bones)
     index = [shape.skeleton.bone(name) for name in bones]
     bone_rotation = rotation_in_world[:, index]
     at = np.array([_middle_m(shape, bone) for bone in index])

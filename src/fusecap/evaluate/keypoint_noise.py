@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from fusecap.body.landmarks import LandmarkSet
+from fusecap.body.landmarks import LANDMARKS, LandmarkSet
 from fusecap.body.pose import forward_kinematics, landmarks_in_world
 from fusecap.body.shape import REFERENCE_HEIGHT_M, BodyShape, end_offsets_m
 from fusecap.body.skeleton import PAPER21
@@ -41,6 +41,7 @@ _SWAPPED_TOGETHER = {
     "legs": ("hip", "knee", "ankle", "big_toe", "small_toe", "heel"),
 }
 _CHUNK = 256
+_DETECTOR_SEED = 25
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,8 +51,12 @@ class KeypointNoise:
     sigma_px: float = 4.0
     """Per axis, for a person who appears 600 px tall; grows with apparent size."""
     correlation_s: float = 0.1
+    detector_bias: float = 0.0
+    """Per axis, by stature: constant distance of everybody's landmarks from the default offsets."""
     landmark_bias_m: float = 0.010
-    """Per axis: constant distance of each person's landmarks from the default offsets."""
+    """Per axis: constant distance of each person's landmarks from everybody's."""
+    clock_s: float = 0.0
+    """Constant error of each camera's clock, which nobody knows of."""
     miss_share: float = 0.03
     """Of keypoints."""
     miss_s: float = 0.1
@@ -168,6 +173,21 @@ def _seen(
     in_cam = (points_in_world_m @ camera.rotation.T + camera.translation).astype(np.float32)
     depth = np.maximum(in_cam[..., 2], np.float32(0.05))
     return in_cam[..., :2] / depth[..., None], depth
+
+
+def detector_bias(landmark_set: LandmarkSet, noise: KeypointNoise) -> Float[np.ndarray, "k 3"]:
+    """Where this detector puts landmarks against their defaults, by stature, in the bones' frames.
+
+    The same for every seed, and the same on both sides of the body.
+    """
+    drawn = np.random.default_rng(_DETECTOR_SEED).standard_normal((len(LANDMARKS), 3))
+    table = dict(zip(LANDMARKS, drawn, strict=True))
+    bias = []
+    for name in landmark_set.landmark_names:
+        side, _, part = name.partition("_")
+        x, y, z = table[f"left_{part}" if side == "right" else name]
+        bias.append([-x if side == "right" else x if side == "left" else 0.0, y, z])
+    return noise.detector_bias * np.array(bias)
 
 
 def detect(

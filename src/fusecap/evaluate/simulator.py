@@ -1,32 +1,44 @@
 """A simulated capture: motion with known truth, seen by cameras and worn IMUs with stated faults.
 
     motion ── forward kinematics ──▶ truth
-                                     ├─ landmarks, cameras, occlusion, KeypointNoise ──▶ Detections
+                                     ├─ landmarks, cameras, occlusion, KeypointNoise ──▶ CameraView
                                      └─ bones, mounting, ImuNoise ──▶ ImuReading
 
 Everything random comes from one seed; each camera and each subject's IMUs draw from a stream of
-their own, so changing one leaves the others as they were. docs/simulation.md lists every fault.
+their own, and `Simulation.subset` leaves cameras and IMUs out of a capture that was made, so that
+what remains is bit for bit the same. docs/simulation.md lists every fault.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.body.pose import forward_kinematics, landmarks_in_world
 from fusecap.body.shape import BodyShape
 from fusecap.errors import InputError
 from fusecap.evaluate.imu_noise import ImuNoise, SimulatedImus, measure
-from fusecap.evaluate.keypoint_noise import KeypointNoise, body_capsules, detect, together
+from fusecap.evaluate.keypoint_noise import (
+    KeypointNoise,
+    body_capsules,
+    detect,
+    detector_bias,
+    together,
+)
 from fusecap.geometry.camera import Camera, Rig
 from fusecap.sinks.take import Take, provenance, take_from_theta
+from fusecap.sources.keypoint_files import KeypointTrack
+from fusecap.sources.synchronizer import people_at
 from fusecap.types import Detections, ImuReading
+
+Progress = Callable[[str, int, int], None]
+"""Called with (what is being simulated, done, in all)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,9 +47,42 @@ class Person:
 
     name: str
     shape: BodyShape
+    """The true one; a solver may be told less."""
     theta: Float[np.ndarray, "t p"]
     imu_bones: tuple[str, ...] = ()
     bystander: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraTiming:
+    """When a camera exposes: its frame n at n / rate + offset on the scene's clock."""
+
+    rate_hz: float
+    offset_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.rate_hz) and self.rate_hz > 0):
+            raise InputError(f"a camera's rate is {self.rate_hz:g} Hz; expected more than zero")
+        if not (np.isfinite(self.offset_s) and self.offset_s >= 0):
+            raise InputError(f"a camera's offset is {self.offset_s:g} s; expected zero or more")
+
+    def times_s(self, duration_s: float) -> Float[np.ndarray, " f"]:
+        """Of the frames up to `duration_s`."""
+        count = int(np.floor((duration_s - self.offset_s) * self.rate_hz + 1e-6)) + 1
+        return np.arange(max(count, 0)) / self.rate_hz + self.offset_s
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraView:
+    """What one camera delivered, in frames of its own."""
+
+    timing: CameraTiming
+    times_s: Float[np.ndarray, " f"]
+    """As anybody would know them, a clock error not included."""
+    people: tuple[Float[np.ndarray, "_ k 3"], ...]
+    """Per frame, like `Detections.people`."""
+    person: tuple[Int[np.ndarray, " _"], ...]
+    """Per frame whose each detection is, an index into `Simulation.people`, or -1."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,12 +96,12 @@ class Simulation:
     rate_hz: float
     truth: Take
     """The subjects, without bystanders."""
-    detections: tuple[Detections, ...]
-    """Per frame."""
-    detected_person: tuple[tuple[Int[np.ndarray, " _"], ...], ...]
-    """Per frame and camera: whose each detection is, an index into `people`, or -1."""
+    views: tuple[CameraView, ...]
+    """In the order of the rig."""
     imus: dict[str, SimulatedImus]
     """Per subject that wears any."""
+    landmark_offsets_m: tuple[Float[np.ndarray, "k 3"], ...]
+    """Per person where the detector's landmarks truly lie, in the bones' frames."""
     volume_m: tuple[float, float, float, float] | None = None
     """Capture volume: x_min, x_max, z_min, z_max."""
     seed: int = 0
@@ -68,10 +113,80 @@ class Simulation:
         """Everyone who is to be tracked, in the order of `truth`."""
         return tuple(person for person in self.people if not person.bystander)
 
+    @property
+    def synchronous(self) -> bool:
+        """Whether every camera exposes at the instants of the truth."""
+        scene = CameraTiming(rate_hz=self.rate_hz)
+        return all(view.timing == scene for view in self.views)
+
+    @cached_property
+    def detections(self) -> tuple[Detections, ...]:
+        """Per instant of the truth; interpolated as a session's are where cameras do not agree."""
+        times_ns = self.truth.timestamps_ns
+        if self.synchronous:
+            return tuple(
+                Detections(timestamp_ns=int(t), people=tuple(v.people[i] for v in self.views))
+                for i, t in enumerate(times_ns)
+            )
+        tracks = [
+            KeypointTrack(
+                name=name,
+                landmarks=self.landmark_set,
+                rate_hz=view.timing.rate_hz,
+                frames=np.arange(len(view.times_s)),
+                times_s=view.times_s,
+                people=view.people,
+                broken=(),
+            )
+            for name, view in zip(self.rig.names, self.views, strict=True)
+        ]
+        return tuple(
+            Detections(
+                timestamp_ns=int(t),
+                people=tuple(people_at(track, float(t) * 1e-9) for track in tracks),
+            )
+            for t in times_ns
+        )
+
+    @property
+    def detected_person(self) -> tuple[tuple[Int[np.ndarray, " _"], ...], ...]:
+        """Per instant and camera: whose each of `detections` is, an index into `people`, or -1."""
+        if not self.synchronous:
+            raise InputError(
+                "cameras of different rates or offsets: whose each detection is, is known per "
+                "frame of each camera (views), not per instant"
+            )
+        frames = range(len(self.truth.timestamps_ns))
+        return tuple(tuple(view.person[frame] for view in self.views) for frame in frames)
+
     @cached_property
     def imu_readings(self) -> dict[str, tuple[ImuReading, ...]]:
-        """Per subject and frame, in the order of its `imus[...].bones`."""
+        """Per subject and instant of the truth, in the order of its `imus[...].bones`."""
         return {name: imus.readings() for name, imus in self.imus.items()}
+
+    def subset(
+        self,
+        *,
+        cameras: Sequence[str] | None = None,
+        imu_bones: Sequence[str] | None = None,
+    ) -> Simulation:
+        """This very capture with only the named cameras, and sensors only on the named bones."""
+        names = self.rig.names if cameras is None else tuple(cameras)
+        rig = self.rig.subset(names)
+        imus = self.imus
+        if imu_bones is not None:
+            kept = {name: worn.subset(imu_bones) for name, worn in self.imus.items()}
+            imus = {name: worn for name, worn in kept.items() if worn.bones}
+        return replace(
+            self,
+            rig=rig,
+            views=tuple(self.views[self.rig.names.index(name)] for name in names),
+            imus=imus,
+            people=tuple(
+                replace(person, imu_bones=imus[person.name].bones if person.name in imus else ())
+                for person in self.people
+            ),
+        )
 
 
 def simulate(
@@ -85,43 +200,68 @@ def simulate(
     imu_noise: ImuNoise | None = None,
     name: str = "simulation",
     volume_m: tuple[float, float, float, float] | None = None,
+    timing: Sequence[CameraTiming] | None = None,
+    progress: Progress | None = None,
 ) -> Simulation:
-    """Capture `people` in motion, all over the same frames; the same seed gives the same bits."""
+    """Capture `people` in motion, all over the same frames; the same seed gives the same bits.
+
+    `timing` has one entry per camera; by default all expose at the motion's instants.
+    """
     keypoint_noise = keypoint_noise or KeypointNoise()
     imu_noise = imu_noise or ImuNoise()
-    lengths = {len(person.theta) for person in people}
-    if len(lengths) != 1:
-        raise InputError(f"simulated people need motions of one length; got {sorted(lengths)}")
-    frames = lengths.pop()
-    timestamps_ns = np.round(np.arange(frames) * (1e9 / rate_hz)).astype(np.int64)
+    frames = _common_length(people)
+    times_s = np.arange(frames) / rate_hz
+    timing = timing or [CameraTiming(rate_hz=rate_hz)] * len(rig)
+    if len(timing) != len(rig):
+        raise InputError(f"{len(timing)} camera timings for {len(rig)} cameras")
     streams = np.random.default_rng(seed).spawn(1 + len(rig) + len(people))
+    subjects = [person for person in people if not person.bystander]
+    if not subjects:
+        raise InputError("a simulation needs a subject; everybody is a bystander")
 
-    landmarks, capsules, imus = [], [], {}
+    offsets_m, imus = [], {}
+    common = detector_bias(landmark_set, keypoint_noise)
     for stream, person in zip(streams[1 + len(rig) :], people, strict=True):
-        position, rotation = forward_kinematics(person.shape, person.theta)
-        bones = landmark_set.bones(person.shape.skeleton)
-        offsets = landmark_set.offsets_m(person.shape)
-        bias = keypoint_noise.landmark_bias_m * streams[0].standard_normal(offsets.shape)
-        landmarks.append(landmarks_in_world(position, rotation, bones, offsets + bias))
-        capsules.append(body_capsules(person.shape, position, rotation))
+        own = keypoint_noise.landmark_bias_m * streams[0].standard_normal(common.shape)
+        default = landmark_set.offsets_m(person.shape)
+        offsets_m.append(default + common * person.shape.height_m + own)
         if person.imu_bones:
             imus[person.name] = measure(
-                stream, person.shape, position, rotation, person.imu_bones, imu_noise, rate_hz
+                stream, person.shape, person.theta, person.imu_bones, imu_noise, rate_hz
             )
-    seen = [
-        detect(
+    views = []
+    synchronous = _Scene(people, offsets_m, landmark_set, rate_hz, times_s)
+    for index, (stream, camera, when) in enumerate(
+        zip(streams[1 : 1 + len(rig)], rig.cameras, timing, strict=True)
+    ):
+        if progress:
+            progress("cameras", index, len(rig))
+        told_s = when.times_s(times_s[-1])
+        clock_error_s = keypoint_noise.clock_s * stream.standard_normal()
+        scene = synchronous
+        if clock_error_s or len(told_s) != frames or not np.allclose(told_s, times_s, atol=1e-9):
+            exposed_s = np.clip(told_s + clock_error_s, 0.0, times_s[-1])
+            scene = _Scene(people, offsets_m, landmark_set, rate_hz, exposed_s)
+        seen = detect(
             stream,
             camera,
             landmark_set,
-            np.stack(landmarks, axis=1),
+            scene.landmarks_in_world_m,
             np.array([person.shape.height_m for person in people]),
-            together(capsules),
+            scene.capsules,
             keypoint_noise,
-            rate_hz,
+            when.rate_hz,
         )
-        for stream, camera in zip(streams[1 : 1 + len(rig)], rig.cameras, strict=True)
-    ]
-    subjects = [person for person in people if not person.bystander]
+        views.append(
+            CameraView(
+                timing=when,
+                times_s=told_s,
+                people=tuple(keypoints for keypoints, _ in seen),
+                person=tuple(whose for _, whose in seen),
+            )
+        )
+    if progress:
+        progress("cameras", len(rig), len(rig))
     return Simulation(
         name=name,
         rig=rig,
@@ -131,26 +271,67 @@ def simulate(
         truth=take_from_theta(
             np.stack([person.theta for person in subjects]),
             [person.shape for person in subjects],
-            timestamps_ns=timestamps_ns,
+            timestamps_ns=np.round(np.arange(frames) * (1e9 / rate_hz)).astype(np.int64),
             rate_hz=rate_hz,
             subject_names=tuple(person.name for person in subjects),
             skeleton=subjects[0].shape.skeleton,
             provenance=provenance(options={"seed": seed}, simulated=True),
         ),
-        detections=tuple(
-            Detections(
-                timestamp_ns=int(timestamps_ns[frame]),
-                people=tuple(view[frame][0] for view in seen),
-            )
-            for frame in range(frames)
-        ),
-        detected_person=tuple(tuple(view[frame][1] for view in seen) for frame in range(frames)),
+        views=tuple(views),
         imus=imus,
+        landmark_offsets_m=tuple(offsets_m),
         volume_m=volume_m,
         seed=seed,
         keypoint_noise=keypoint_noise,
         imu_noise=imu_noise,
     )
+
+
+def _common_length(people: Sequence[Person]) -> int:
+    lengths = {len(person.theta) for person in people}
+    if len(lengths) != 1:
+        raise InputError(f"simulated people need motions of one length; got {sorted(lengths)}")
+    return lengths.pop()
+
+
+class _Scene:
+    """Everyone's landmarks and solid parts at some instants."""
+
+    def __init__(
+        self,
+        people: Sequence[Person],
+        offsets_m: Sequence[Float[np.ndarray, "k 3"]],
+        landmark_set: LandmarkSet,
+        rate_hz: float,
+        times_s: Float[np.ndarray, " f"],
+    ) -> None:
+        landmarks, capsules = [], []
+        for person, offsets in zip(people, offsets_m, strict=True):
+            theta = at_times(person.theta, rate_hz, times_s)
+            position, rotation = forward_kinematics(person.shape, theta)
+            bones = landmark_set.bones(person.shape.skeleton)
+            landmarks.append(landmarks_in_world(position, rotation, bones, offsets))
+            capsules.append(body_capsules(person.shape, position, rotation))
+        self.landmarks_in_world_m = np.stack(landmarks, axis=1)
+        self.capsules = together(capsules)
+
+
+def at_times(
+    theta: Float[np.ndarray, "t p"], rate_hz: float, times_s: Float[np.ndarray, " f"]
+) -> Float[np.ndarray, "f p"]:
+    """Poses between the frames of a motion that starts at 0 s: root linear, rotations by slerp."""
+    frame = times_s * rate_hz
+    if len(theta) == 1 or np.allclose(frame, np.round(frame), atol=1e-6):
+        return theta[np.clip(np.round(frame).astype(np.int64), 0, len(theta) - 1)]
+    own = np.arange(len(theta), dtype=np.float64)
+    frame = np.clip(frame, 0.0, own[-1])
+    between = np.empty((len(frame), theta.shape[1]))
+    for axis in range(3):
+        between[:, axis] = np.interp(frame, own, theta[:, axis])
+    for bone in range(3, theta.shape[1], 3):
+        turn = Slerp(own, Rotation.from_rotvec(theta[:, bone : bone + 3]))
+        between[:, bone : bone + 3] = turn(frame).as_rotvec()
+    return between
 
 
 def camera_ring(

@@ -3,7 +3,7 @@
 Eq. 17 of the paper: the point of least confidence-weighted Cauchy reprojection cost. It starts from
 the linear solution on undistorted coordinates or, where one view contradicts the rest, from the
 best solution of two views; reweighted Gauss-Newton steps follow until they move it less than
-1 mm. One outlier among three
+0.1 mm. One outlier among three
 views is so ignored; of two views that disagree neither can be believed, and the landmark is NaN.
 """
 

@@ -315,7 +315,7 @@ def _triangulate_point(cameras, camera, row, views, scale_px, h, g, points, resi
                             best[:] = trial
     if cost == np.inf:
         return np.nan
-    for _ in range(10):
+    for _ in range(12):
         h[:] = 0.0
         g[:] = 0.0
         for v in range(views):
@@ -333,7 +333,7 @@ def _triangulate_point(cameras, camera, row, views, scale_px, h, g, points, resi
         if not _solve3(h, g, trial):
             return np.nan
         best += trial
-        if trial[0] ** 2 + trial[1] ** 2 + trial[2] ** 2 < 1e-6:
+        if trial[0] ** 2 + trial[1] ** 2 + trial[2] ** 2 < 1e-8:
             break
     _residuals(cameras, camera, row, views, scale_px, best, residual_px)
     inliers = 0
@@ -515,3 +515,50 @@ def move_tracks(measured, predicted, dt_s, position_gain, velocity_gain, landmar
                 if dt_s[t] > 0.0 and not math.isnan(change):
                     velocity[t, k, i] += velocity_gain * (change / dt_s[t] - velocity[t, k, i])
                 landmarks[t, k, i] = moved
+
+
+@kernel("b1(f8[:, ::1], f8[::1], i8[::1], b1[::1], i8[:, ::1], b1[:, ::1])")
+def assign_undisputed(distance_m, gate_m, camera_of, free, person, disputed_out):
+    """Assign, in place, the pairs (t, n) inside the gate that nobody else is near to.
+
+    `disputed_out` marks the pairs that remain to be decided; the result says whether there are any.
+    """
+    tracks, people = distance_m.shape
+    rivals = np.zeros(people, np.int64)
+    choices = np.zeros(person.shape, np.int64)
+    for t in range(tracks):
+        for n in range(people):
+            c = camera_of[n]
+            near = free[n] and person[t, c] < 0 and distance_m[t, n] < gate_m[t]
+            disputed_out[t, n] = near
+            rivals[n] += near
+            choices[t, c] += near
+    remains = False
+    for t in range(tracks):
+        for n in range(people):
+            if disputed_out[t, n]:
+                if rivals[n] == 1 and choices[t, camera_of[n]] == 1:
+                    person[t, camera_of[n]] = n
+                    free[n] = False
+                    disputed_out[t, n] = False
+                else:
+                    remains = True
+    return remains
+
+
+@kernel("void(f8[:, :, ::1], f8, i8, b1[:, ::1])")
+def coincide(points, limit_m, min_common, same_out):
+    """Which skeletons of (t, k, 3) have most of their common landmarks within the limit (t, t)."""
+    tracks, landmarks = points.shape[:2]
+    for a in range(tracks):
+        same_out[a, a] = True
+        for b in range(a):
+            common = close = 0
+            for k in range(landmarks):
+                dx = points[a, k, 0] - points[b, k, 0]
+                dy = points[a, k, 1] - points[b, k, 1]
+                dz = points[a, k, 2] - points[b, k, 2]
+                squared = dx * dx + dy * dy + dz * dz
+                common += not math.isnan(squared)
+                close += squared < limit_m * limit_m
+            same_out[a, b] = same_out[b, a] = common >= min_common and 2 * close > common

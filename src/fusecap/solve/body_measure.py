@@ -49,12 +49,9 @@ class BodyMeasure:
     def __post_init__(self) -> None:
         shape = BodyShape.from_height(self.skeleton, 1.75)
         position, rotation = forward_kinematics(shape, np.zeros((1, self.skeleton.pose_size)))
-        self._rest = landmarks_in_world(
-            position,
-            rotation,
-            self.landmarks.bones(self.skeleton),
-            self.landmarks.offsets_m(shape),
-        )[0]
+        bones = self.landmarks.bones(self.skeleton)
+        rest = landmarks_in_world(position, rotation, bones, self.landmarks.offsets_m(shape))[0]
+        joints = position[0, bones]
         self._pairs = {
             name: [
                 (a, b)
@@ -65,10 +62,13 @@ class BodyMeasure:
             for name, pairs in _SEGMENTS.items()
         }
         self._reference = {
-            name: float(np.mean([np.linalg.norm(self._rest[a] - self._rest[b]) for a, b in pairs]))
-            for name, pairs in self._pairs.items()
-            if pairs
+            name: _mean_length(rest, pairs) for name, pairs in self._pairs.items() if pairs
         }
+        self._joints_per_landmarks = {
+            name: _mean_length(joints, self._pairs[name]) / length
+            for name, length in self._reference.items()
+        }
+        """Joint-to-joint over landmark-to-landmark length; 1 with landmarks on the joints."""
 
     def add(self, points_in_world_m: Float[np.ndarray, "k 3"]) -> None:
         """One instant's triangulated landmarks; NaN where missing."""
@@ -97,7 +97,8 @@ class BodyMeasure:
             return None
         scale = sum(lengths[n] for n in measured) / sum(self._reference[n] for n in measured)
         height_m = float(np.clip(1.75 * scale, MIN_HEIGHT_M, MAX_HEIGHT_M))
-        return self._with(BodyShape.from_height(self.skeleton, height_m), lengths)
+        between_joints = {name: x * self._joints_per_landmarks[name] for name, x in lengths.items()}
+        return self._with(BodyShape.from_height(self.skeleton, height_m), between_joints)
 
     def _with(self, shape: BodyShape, lengths: dict[str, float]) -> BodyShape:
         offsets = shape.offsets_m.copy()
@@ -124,3 +125,7 @@ class BodyMeasure:
             wanted = np.sqrt(max(lengths["trunk"] ** 2 - side[0] ** 2, 0.04))
             offsets[spine, 1] += (wanted - side[1]) / len(spine)
         return BodyShape(skeleton=self.skeleton, offsets_m=offsets, height_m=shape.height_m)
+
+
+def _mean_length(points: Float[np.ndarray, "k 3"], pairs: list[tuple[int, int]]) -> float:
+    return float(np.mean([np.linalg.norm(points[a] - points[b]) for a, b in pairs]))

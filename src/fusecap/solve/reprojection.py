@@ -31,7 +31,7 @@ class Reprojection:
                 estimate.bone_position_in_world_m[None],
                 estimate.bone_rotation_in_world[None],
                 self._landmarks.bones(shape.skeleton),
-                self._landmarks.offsets_m(shape),
+                self._landmarks.of(estimate.name).offsets_m(shape),
             )[0]
         )
         self._keypoints.append(keypoints)

@@ -34,7 +34,7 @@ SAMPLED_INSTANTS = 60
 MAX_DISAGREEMENT_SHARE = 0.01
 """Of the image's diagonal: 22 px of a 1920 x 1080 image."""
 NOTABLE_DISAGREEMENT_SHARE = 0.005
-"""The same of a camera that disagrees twice as much as the others."""
+"""The same of a camera that disagrees twice as much as the others, and of a typical pair."""
 LOW_COVERAGE = 0.1
 SHIFT_RANGE_S = 1.0
 PEOPLE_HEIGHT_M = (0.7, 2.2)
@@ -174,19 +174,28 @@ def _all_people(track: KeypointTrack) -> np.ndarray:
     return np.concatenate(track.people[::step])
 
 
-_LIMBS = [
-    (f"{side}_{a}", f"{side}_{b}")
-    for side in ("left", "right")
-    for a, b in (("shoulder", "elbow"), ("elbow", "wrist"), ("hip", "knee"), ("knee", "ankle"))
+_LINKS = [
+    *(("nose", "head_top"), ("head_top", "upper_neck"), ("nose", "neck"), ("mid_hip", "left_hip")),
+    *(("left_shoulder", "right_shoulder"), ("left_hip", "right_hip"), ("neck", "left_shoulder")),
+    *(
+        (f"{side}_{a}", f"{side}_{b}")
+        for side in ("left", "right")
+        for a, b in (
+            *(("eye", "nose"), ("ear", "eye"), ("shoulder", "hip"), ("shoulder", "elbow")),
+            *(("elbow", "wrist"), ("hip", "knee"), ("knee", "ankle"), ("ankle", "heel")),
+            *(("heel", "big_toe"), ("big_toe", "small_toe")),
+        )
+    ),
 ]
+"""Neighbours on the body, so that every landmark has one."""
 
 
 def _check_order(track: KeypointTrack, findings: _Findings) -> None:
-    """Read in the wrong order, the ends of limbs lie far apart."""
+    """Read in the wrong order, neighbours on the body lie far apart in the image."""
     people = _all_people(track)
     stated = track.landmarks
     lengths = {
-        other.name: _limb_length(people, other)
+        other.name: _link_length(people, other)
         for other in LANDMARK_SETS.values()
         if len(other.landmark_names) == len(stated.landmark_names)
     }
@@ -200,9 +209,12 @@ def _check_order(track: KeypointTrack, findings: _Findings) -> None:
         )
 
 
-def _limb_length(people: np.ndarray, landmarks: LandmarkSet) -> float:
-    """Median limb length [px]; infinite when no limb is seen."""
-    pairs = [(landmarks.index(a), landmarks.index(b)) for a, b in _LIMBS]
+def _link_length(people: np.ndarray, landmarks: LandmarkSet) -> float:
+    """Mean distance of neighbours [px]; infinite when none are seen.
+
+    All keypoints are linked, so that no order can look short by leaving the long ways out.
+    """
+    pairs = [(landmarks.index(a), landmarks.index(b)) for a, b in _LINKS]
     known = np.array([(a, b) for a, b in pairs if a is not None and b is not None])
     span = np.linalg.norm(people[:, known[:, 0], :2] - people[:, known[:, 1], :2], axis=2)
     return float(np.nanmean(span)) if np.isfinite(span).any() else np.inf
@@ -341,6 +353,7 @@ def _check_views(
     times_s = start + np.arange(0, count, step) / fastest_hz
     pairs = view_agreement.disagreement_px(rig, every, times_s)
     own = view_agreement.per_camera_px(pairs)
+    single = False
     for index, camera in enumerate(rig.cameras):
         share = own[index] / np.hypot(*camera.size_px)
         others = np.delete(own, index)
@@ -348,7 +361,25 @@ def _check_views(
         outstanding = len(others) > 0 and own[index] > 2 * np.median(others)
         if share > MAX_DISAGREEMENT_SHARE or (outstanding and share > NOTABLE_DISAGREEMENT_SHARE):
             _report_disagreement(rig, every, index, own[index], times_s, findings)
+            single = True
+    if not single:
+        _check_looseness(rig, pairs, findings)
     _check_people(session, rig, every, times_s, findings)
+
+
+def _check_looseness(rig: Rig, pairs_px: np.ndarray, findings: _Findings) -> None:
+    """Pairs that all disagree a little: nobody stands out, but the calibration is poor."""
+    shares = pairs_px / np.mean([np.hypot(*camera.size_px) for camera in rig.cameras])
+    if not np.isfinite(shares).any() or np.nanmedian(shares) <= NOTABLE_DISAGREEMENT_SHARE:
+        return
+    i, j = np.unravel_index(np.nanargmax(shares), shares.shape)
+    findings.add(
+        "warning",
+        "calibration",
+        f"cameras disagree by a median of {np.nanmedian(pairs_px):.0f} px; worst are "
+        f"'{rig.cameras[i].name}' and '{rig.cameras[j].name}' with {pairs_px[i, j]:.0f} px",
+        "recalibrate the extrinsics, or check offset_s and rate_hz",
+    )
 
 
 def _report_disagreement(
@@ -388,7 +419,8 @@ def _check_people(
     if len(heads) < 5:
         return
     body = heads - feet
-    tall = float(np.median(np.linalg.norm(body, axis=1)))
+    # The tallest posture counts: some sit or crouch, and units are wrong by a factor.
+    tall = float(np.percentile(np.linalg.norm(body, axis=1), 90))
     direction = np.median(body / np.linalg.norm(body, axis=1, keepdims=True), axis=0)
     direction /= np.linalg.norm(direction)
     if direction[1] < np.cos(np.radians(45)):

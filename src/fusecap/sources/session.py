@@ -161,6 +161,8 @@ class SessionSettings(_Table):
     skeleton: Annotated[str, _one_of(["paper21", "extended23"])] = "paper21"
     volume_m: tuple[Number, Number, Number, Number] | None = None
     """x_min, x_max, z_min, z_max in the y-up world."""
+    landmark_offsets: File | None = None
+    """Calibrated landmark offsets, as `fusecap calibrate offsets` writes them."""
     associate: Annotated[str, _one_of(["tracker", "paper"])] = "tracker"
 
     @model_validator(mode="after")
@@ -376,6 +378,7 @@ def missing_files(session: Session) -> list[str]:
             lines.append(f"{where}: {path} is not a {kind}")
 
     check("[session] calibration", session.settings.calibration, folder=None)
+    check("[session] landmark_offsets", session.settings.landmark_offsets, folder=False)
     for camera in session.cameras:
         check(f"[[camera]] '{camera.name}' keypoints", camera.keypoints, folder=True)
         check(f"[[camera]] '{camera.name}' video", camera.video, folder=False)

@@ -23,6 +23,7 @@ from fusecap.sources.calibration_files import check_rig, load_rig
 from fusecap.sources.findings import Finding
 from fusecap.sources.imu_files import ImuTrack, read_imu
 from fusecap.sources.keypoint_files import KeypointTrack, read_keypoints
+from fusecap.sources.offset_files import read_offsets
 from fusecap.sources.session import ImuSettings, Session, SubjectSettings
 from fusecap.sources.synchronizer import (
     MAX_GAP_S,
@@ -167,7 +168,10 @@ def open_rig(session: Session) -> tuple[Rig, list[Finding]]:
 
 
 def common_landmarks(session: Session) -> LandmarkSet | None:
-    """The one landmark set of all cameras; raises `SessionError` when they differ."""
+    """The one landmark set of all cameras, with the session's offsets; None without cameras.
+
+    Raises `SessionError` when cameras differ, `InputError` for offsets that cannot be used.
+    """
     names = {camera.name: camera.landmark_set_name for camera in session.cameras}
     if len(set(names.values())) > 1:
         listed = ", ".join(f"'{camera}' openpose-{name}" for camera, name in names.items())
@@ -175,7 +179,12 @@ def common_landmarks(session: Session) -> LandmarkSet | None:
             f"{session.path}: cameras with different keypoint formats ({listed}); "
             "expected one format for all: run the same detector on every camera"
         )
-    return landmark_set_named(next(iter(names.values()))) if names else None
+    if not names:
+        return None
+    landmarks = landmark_set_named(next(iter(names.values())))
+    if session.settings.landmark_offsets is None:
+        return landmarks
+    return landmarks.calibrated(read_offsets(session.settings.landmark_offsets, landmarks.name))
 
 
 def _keypoints(
@@ -317,7 +326,7 @@ def content_hash(session: Session) -> str:
     Of keypoint folders names and sizes only. The same inputs hash alike in every folder.
     """
     digest = hashlib.sha256(session.path.read_bytes() if session.path.is_file() else b"")
-    inputs = [session.settings.calibration]
+    inputs = [session.settings.calibration, session.settings.landmark_offsets]
     inputs += [imu.file for subject in session.subjects for imu in subject.imus]
     for path in inputs:
         if path is not None and path.is_dir():

@@ -4,7 +4,7 @@ Inside metres, seconds and radians; a report converts. NaN in an estimate or in 
 "not there" and makes every error that needs it NaN.
 """
 
-from fusecap.evaluate.metrics.contact import CONTACT_SPEED_M_S, foot_contact, foot_skate_m_s
+from fusecap.evaluate.metrics.contact import foot_contact, foot_skate_m_s, standing_heights_m
 from fusecap.evaluate.metrics.motion import acceleration_error_m_s2, jitter_m_s3
 from fusecap.evaluate.metrics.people import (
     false_tracks,
@@ -27,7 +27,6 @@ from fusecap.evaluate.metrics.summary import Summary, summarize
 from fusecap.evaluate.metrics.twist import axial_error_rad, long_axes, swing_error_rad
 
 __all__ = [
-    "CONTACT_SPEED_M_S",
     "Summary",
     "acceleration_error_m_s2",
     "aligned_error_m",
@@ -48,6 +47,7 @@ __all__ = [
     "procrustes",
     "procrustes_rotation",
     "root_relative_error_m",
+    "standing_heights_m",
     "summarize",
     "swing_error_rad",
 ]

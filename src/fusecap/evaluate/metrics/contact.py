@@ -5,10 +5,21 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float
 
+from fusecap.body.shape import BodyShape
+
 CONTACT_SPEED_M_S = 0.15
 """A foot joint slower than this may be in contact; optical truth wanders by about 0.05 m/s."""
 CONTACT_HEIGHT_M = 0.05
 """And no higher than this above where it rests on the floor."""
+
+
+def standing_heights_m(shape: BodyShape) -> Float[np.ndarray, " b"]:
+    """Height of every joint over the floor in the rest pose [m]."""
+    height = np.empty(shape.skeleton.bone_count)
+    height[0] = shape.standing_root_height_m
+    for bone, parent in enumerate(shape.skeleton.parents[1:], start=1):
+        height[bone] = height[parent] + shape.offsets_m[bone, 1]
+    return height
 
 
 def foot_contact(

@@ -3,9 +3,9 @@
 A difference reaches over three or four frames, so the first and last frames, and those beside a
 gap, have none: NaN. Frames are taken to be evenly spaced.
 
-The worst of noise: 1 mm of white noise per axis at 60 Hz is 15.6 m/s² of acceleration (a second
-difference adds 1 + 4 + 1 variances, and the length of three axes is 1.6 times one) and 1.7 km/s³
-of jitter, where a walk has 0.1-0.3 km/s³.
+Both are harsh on noise: 1 mm of it per axis, white, at 60 Hz is 14.1 m/s² of acceleration (a
+second difference adds 1 + 4 + 1 variances, and the mean length of three axes is 1.6 sigma) and
+1.5 km/s³ of jitter.
 """
 
 from __future__ import annotations

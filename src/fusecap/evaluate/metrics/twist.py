@@ -34,9 +34,8 @@ def axial_error_rad(
 ) -> Float[np.ndarray, "*n b"]:
     """Size of the twist about the bone's long axis, 0 to pi; NaN where the axis is turned round.
 
-    For R = truthᵀ estimate with quaternion (w, v) and axis u the twist is 2 atan2(v·u, w). From the
-    matrix, without a quaternion: 4w v·u = (R - Rᵀ)∨·u and 4w² = 1 + tr R, and where w is small
-    the ratio comes from 4(v·u)² = 1 - tr R + 2 uᵀRu instead.
+    For R = truthᵀ estimate with quaternion (w, v) and axis u the twist is 2 atan2(v·u, w); the
+    matrix holds what that needs: 4w² = 1 + tr R, 4w v·u = (R - Rᵀ)∨·u, 4(v·u)² = 1 - tr R + 2 uᵀRu.
     """
     relative = np.swapaxes(truth, -1, -2) @ estimate
     trace = np.trace(relative, axis1=-2, axis2=-1)

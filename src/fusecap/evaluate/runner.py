@@ -1,0 +1,298 @@
+"""A grid of independent cells, computed on all cores or on a Ray cluster, and resumed after a kill.
+
+    cells ──key──▶ already in the folder? ──no──▶ workers ──▶ result written at once
+                          └──────────yes──────────────────▶ result read
+
+A cell is a frozen dataclass of plain values and `work(cell)` a module-level function that returns
+plain values. The key is a hash of the cell, of the function's name and of the versions that the
+result depends on, so a result is used again exactly when it would come out the same. A cell that
+fails is reported and not written: the next run tries it again. The rest of the grid is kept.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import fusecap
+from fusecap.errors import InputError
+from fusecap.sinks.files import written_whole
+
+Work = Callable[[Any], dict[str, Any]]
+Progress = Callable[["Outcome", int, int], None]
+"""Called as each cell ends, with (what became of it, cells done, cells in all)."""
+
+_ONE_THREAD = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
+)
+_NOT_IN_RESULTS = (
+    "__main__.py",
+    "cli.py",
+    "evaluate/experiments/",
+    "evaluate/runner.py",
+    "evaluate/tables.py",
+    "sinks/bvh.py",
+    "sinks/plot.py",
+    "sources/",
+)
+_FORMAT = "fusecap cell 1"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What became of one cell: a result or an error."""
+
+    cell: Any
+    key: str
+    result: dict[str, Any] | None = None
+    error: str = ""
+    """Type and message; empty when there is a result."""
+    elapsed_s: float = 0.0
+    """Of the work alone, when it was done."""
+    resumed: bool = False
+    """Read from an earlier run."""
+
+
+def run_cells(
+    cells: Sequence[Any],
+    work: Work,
+    *,
+    folder: Path,
+    versions: Mapping[str, str] | None = None,
+    workers: int | None = None,
+    ray: str | None = None,
+    progress: Progress | None = None,
+) -> list[Outcome]:
+    """Compute `cells`, each once, and return their outcomes in order.
+
+    `workers` processes (all cores unless told), each with one thread for its arrays; or the Ray
+    cluster at address `ray`, "local" for one on this machine. `folder` keeps one JSON file per
+    finished cell. `versions` are added to that of the code in each key.
+    """
+    versions = {"code": code_version(), **(versions or {})}
+    keys = [cell_key(cell, work, versions) for cell in cells]
+    outcomes: dict[str, Outcome] = {}
+    waiting: dict[str, Any] = {}
+    for key, cell in zip(keys, cells, strict=True):
+        if key in outcomes or key in waiting:
+            continue
+        known = _read(folder / f"{key}.json")
+        if known is None:
+            waiting[key] = cell
+        else:
+            outcomes[key] = Outcome(cell=cell, key=key, resumed=True, **known)
+    total = len(outcomes) + len(waiting)
+    if progress:
+        for done, outcome in enumerate(outcomes.values(), start=1):
+            progress(outcome, done, total)
+    for key, result, error, elapsed_s in _compute(waiting, work, workers, ray):
+        outcome = Outcome(
+            cell=waiting[key], key=key, result=result, error=error, elapsed_s=elapsed_s
+        )
+        if result is not None:
+            _write(folder / f"{key}.json", outcome, versions)
+        outcomes[key] = outcome
+        if progress:
+            progress(outcome, len(outcomes), total)
+    return [outcomes[key] for key in keys]
+
+
+def cell_key(cell: Any, work: Work, versions: Mapping[str, str]) -> str:
+    """Name of a cell's file: changes with anything that its result depends on."""
+    content = {
+        "cell": [type(cell).__qualname__, asdict(cell)],
+        "work": f"{work.__module__}.{work.__qualname__}",
+        "versions": dict(versions),
+    }
+    text = json.dumps(content, sort_keys=True, allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()[:20]
+
+
+@cache
+def code_version() -> str:
+    """Version of the package and a hash of its code and data, but for what only shows results."""
+    root = Path(fusecap.__file__).parent
+    digest = hashlib.sha256()
+    for path in sorted(root.rglob("*")):
+        name = path.relative_to(root).as_posix()
+        if path.suffix not in (".py", ".npz", ".json") or name.startswith(_NOT_IN_RESULTS):
+            continue
+        digest.update(name.encode() + b"\0" + path.read_bytes() + b"\0")
+    return f"{metadata.version('fusecap')}+{digest.hexdigest()[:12]}"
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    """Result and time of a finished cell; None where there is none, or not a whole one."""
+    try:
+        stored = json.loads(path.read_text(encoding="utf-8"))
+        if stored["format"] != _FORMAT or not isinstance(stored["result"], dict):
+            return None
+        return {"result": stored["result"], "elapsed_s": float(stored["elapsed_s"])}
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _write(path: Path, outcome: Outcome, versions: Mapping[str, str]) -> None:
+    stored = {
+        "format": _FORMAT,
+        "cell": asdict(outcome.cell),
+        "versions": dict(versions),
+        "elapsed_s": outcome.elapsed_s,
+        "result": outcome.result,
+    }
+    with written_whole(path) as file:
+        file.write(json.dumps(stored, indent=1).encode())
+
+
+_Ended = tuple[str, dict[str, Any] | None, str, float]
+"""Key, result, error, seconds."""
+
+
+def _timed(work: Work, cell: Any) -> tuple[dict[str, Any] | None, str, float]:
+    """Result or error, and the time it took; what fails in a cell stays in the cell."""
+    started = time.perf_counter()
+    try:
+        result, error = work(cell), ""
+        json.dumps(result, allow_nan=False)
+    except Exception as failure:
+        result, error = None, f"{type(failure).__name__}: {failure}"
+    return result, error, time.perf_counter() - started
+
+
+def _compute(
+    waiting: Mapping[str, Any], work: Work, workers: int | None, ray: str | None
+) -> Iterator[_Ended]:
+    if not waiting:
+        return iter(())
+    if ray is not None:
+        return _on_ray(waiting, work, ray, workers)
+    return _on_cores(waiting, work, min(workers or _cores(), len(waiting)))
+
+
+def _on_cores(waiting: Mapping[str, Any], work: Work, workers: int) -> Iterator[_Ended]:
+    """One process per core; a cell that kills its process fails alone.
+
+    When a process dies every cell in flight is lost and any of them may be the cause, so each of
+    them is tried once more with a pool to itself.
+    """
+    queue: deque[str] = deque(waiting)
+    suspects: deque[str] = deque()
+    while queue or suspects:
+        alone = bool(suspects)
+        source, count = (suspects, 1) if alone else (queue, workers)
+        flying: dict[Future[Any], str] = {}
+        with _pool(count) as pool:
+            try:
+                while source or flying:
+                    while source and len(flying) < count:
+                        flying[pool.submit(_timed, work, waiting[source[0]])] = source[0]
+                        source.popleft()
+                    for future in wait(flying, return_when=FIRST_COMPLETED).done:
+                        ended = future.result()
+                        yield flying.pop(future), *ended
+            except BrokenProcessPool:
+                if alone and flying:
+                    yield next(iter(flying.values())), None, "its process was killed", 0.0
+                elif not alone:
+                    suspects.extend(flying.values())
+
+
+@contextmanager
+def _pool(count: int) -> Iterator[ProcessPoolExecutor]:
+    """Fresh processes that use one thread for their arrays and do not outlive this one."""
+    before = {name: os.environ.get(name) for name in _ONE_THREAD}
+    os.environ.update(_ONE_THREAD)
+    pool = ProcessPoolExecutor(
+        count, mp_context=multiprocessing.get_context("spawn"), initializer=_quit_with_parent
+    )
+    try:
+        yield pool
+    except BaseException:
+        for child in multiprocessing.active_children():
+            child.terminate()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _quit_with_parent() -> None:
+    """A worker waits for work for ever, also when the process that had any was killed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+
+    def quit() -> None:
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=quit, daemon=True).start()
+
+
+def _cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _on_ray(
+    waiting: Mapping[str, Any], work: Work, address: str, workers: int | None
+) -> Iterator[_Ended]:
+    """One Ray task on one core per cell; nodes need this version of fusecap installed."""
+    try:
+        import ray
+    except ImportError:
+        raise InputError("--ray needs Ray; install fusecap[cluster]") from None
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    local = {"num_cpus": workers, "include_dashboard": False} if address == "local" else {}
+    try:
+        ray.init(
+            address=address,
+            log_to_driver=False,
+            logging_level="error",
+            runtime_env={"env_vars": _ONE_THREAD},
+            **local,
+        )
+    except (ConnectionError, ValueError) as error:
+        raise InputError(f"no Ray cluster at '{address}': {error}") from error
+    try:
+        # A task whose worker dies is not repeated: its cell fails, as on our own cores.
+        task = ray.remote(num_cpus=1, max_retries=0)(_same_code)
+        version = code_version()
+        flying = {task.remote(work, cell, version): key for key, cell in waiting.items()}
+        while flying:
+            for reference in ray.wait(list(flying))[0]:
+                try:
+                    ended = ray.get(reference)
+                except ray.exceptions.RayError as error:
+                    ended = None, f"{type(error).__name__}: {str(error).splitlines()[0]}", 0.0
+                yield flying.pop(reference), *ended
+    finally:
+        ray.shutdown()
+
+
+def _same_code(work: Work, cell: Any, version: str) -> tuple[dict[str, Any] | None, str, float]:
+    """`_timed` on a node that runs the code which the key names."""
+    if code_version() != version:
+        return None, f"this node has fusecap {code_version()}, not {version}", 0.0
+    return _timed(work, cell)
