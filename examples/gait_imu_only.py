@@ -216,10 +216,10 @@ def knee_flexion_deg(thigh: Rotation, shank: Rotation) -> np.ndarray:
 def draw(take: Take, folder: Path, result: Score, path: Path) -> None:
     """Side views over one stride with Vicon's legs beneath, front views, and the knees' angles."""
     vicon = read_vicon(folder / "vicon_first_400.csv")
-    figure = Figure(figsize=(15, 11), layout="constrained")
+    figure = Figure(figsize=(15, 12), layout="constrained")
     stride = np.arange(150, 265, 14)
     for row, (title, horizontal, spacing_m) in enumerate(
-        (("from its left", 2, 0.9), ("from the front", 0, 0.9))
+        (("from its right", 2, 0.9), ("from the front", 0, 0.9))
     ):
         ax = figure.add_subplot(3, 1, row + 1)
         for place, frame in enumerate(stride):
@@ -266,7 +266,7 @@ def _draw_person(ax, take: Take, vicon: Vicon, frame: int, horizontal: int, shif
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Solve the walk from IMUs alone.")
     parser.add_argument("folder", type=Path, metavar="DATA_FOLDER")
     parser.add_argument("--out", type=Path, help="keep session, take and picture here")
     arguments = parser.parse_args()

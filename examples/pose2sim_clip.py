@@ -111,7 +111,7 @@ def solved_landmarks(data: SessionData, take: Take) -> np.ndarray:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Solve a Pose2Sim clip.")
     parser.add_argument("folder", type=Path, metavar="DATA_FOLDER")
     parser.add_argument("--trial", choices=TRIALS, default="balancing")
     parser.add_argument("--out", type=Path, help="keep session, take and pictures here")

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -39,8 +40,8 @@ class _RecordingSolver(PoseSolver):
         return super().solve(theta, data)
 
 
-def record_problems(*, frames: int, weights: str) -> tuple[Problems, PoseSolver]:
-    """The problems, and the solver that they were put to (it computes no quality)."""
+def record_problems(*, frames: int, weights: str) -> tuple[Problems, PoseSolver, PoseSolver]:
+    """The problems; the solver that they were put to; the same one with quality per bone."""
     options = SolverOptions(weights=WEIGHTS[weights], quality=False)
     built = scene(cameras=8, frames=frames + _SETTLED)
     model, rig = built.models[0], built.simulation.rig
@@ -67,7 +68,8 @@ def record_problems(*, frames: int, weights: str) -> tuple[Problems, PoseSolver]
     problems = build_problems(
         **parts, floor_bones=FLOOR_BONES, starts=np.stack(starts), data=list(data)
     )
-    return problems, PoseSolver(**parts)
+    with_quality = parts | {"options": replace(options, quality=True)}
+    return problems, PoseSolver(**parts), PoseSolver(**with_quality)
 
 
 def main() -> None:
@@ -76,7 +78,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=400)
     parser.add_argument("--weights", choices=WEIGHTS, default="default")
     arguments = parser.parse_args()
-    problems, _ = record_problems(frames=arguments.frames, weights=arguments.weights)
+    problems, _, _ = record_problems(frames=arguments.frames, weights=arguments.weights)
     write_problems(problems, arguments.out)
     print(f"{len(problems)} frames in {arguments.out}")
 

@@ -108,7 +108,7 @@ def solve_session(data: SessionData, *, progress: Progress | None = None) -> Sol
     scene = scene_of(data)
     return solve_instants(
         scene,
-        _SessionInstants(data),
+        SessionInstants(data),
         progress=progress,
         session_sha256=data.content_hash,
         notes=tuple(str(finding) for finding in data.findings),
@@ -186,12 +186,15 @@ def solve_instants(
     )
 
 
-def scene_of(data: SessionData) -> Scene:
-    """What a session file says about people, cameras and options, as the stages want it."""
+def scene_of(data: SessionData, landmarks: LandmarkSet | None = None) -> Scene:
+    """What a session file says about people, cameras and options, as the stages want it.
+
+    `landmarks` are the session's own unless given.
+    """
     session = data.session
     settings = session.settings
     options = solver_options(session)
-    landmarks = data.landmarks or LANDMARK_SETS["body25"]
+    landmarks = landmarks or data.landmarks or LANDMARK_SETS["body25"]
     sites = {
         imus.subject: ImuSites(
             bone=tuple(session.skeleton.bone(name) for name in imus.bones),
@@ -273,18 +276,24 @@ def _shape(skeleton: Skeleton, subject: SubjectSettings, *, measurable: bool) ->
     return shape.with_lengths(subject.bone_lengths_m)
 
 
-class _SessionInstants:
-    def __init__(self, data: SessionData) -> None:
+class SessionInstants:
+    """The instants `first` to `end` (excluded) of an opened session; all of them unless told."""
+
+    def __init__(self, data: SessionData, first: int = 0, end: int | None = None) -> None:
         self._data = data
+        self._instants = range(len(data.times_s))[first:end]
 
     def __len__(self) -> int:
-        return len(self._data.times_s)
+        return len(self._instants)
 
     def detections(self, instant: int) -> Detections:
-        return self._data.detections(instant)
+        """Everyone in every camera."""
+        return self._data.detections(self._instants[instant])
 
     def readings(self, instant: int) -> Mapping[str, ImuReading]:
-        return {imus.subject: imus.reading(instant) for imus in self._data.imus}
+        """By subject name, what its sensors say."""
+        row = self._instants[instant]
+        return {imus.subject: imus.reading(row) for imus in self._data.imus}
 
 
 @dataclass(frozen=True, kw_only=True)

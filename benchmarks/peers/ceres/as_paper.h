@@ -166,15 +166,18 @@ struct Unpacked {
   }
 };
 
-template <typename Term, std::size_t... Blocks>
+template <int kResiduals, typename Term, std::size_t... Blocks>
 ceres::CostFunction* Templated(const Term& term, int residuals, std::index_sequence<Blocks...>) {
-  using Function =
-      ceres::AutoDiffCostFunction<Unpacked<Term>, ceres::DYNAMIC, (Blocks * 0 + 3)...>;
-  return new Function(new Unpacked<Term>{term}, residuals);
+  using Function = ceres::AutoDiffCostFunction<Unpacked<Term>, kResiduals, (Blocks * 0 + 3)...>;
+  if constexpr (kResiduals == ceres::DYNAMIC)
+    return new Function(new Unpacked<Term>{term}, residuals);
+  else
+    return new Function(new Unpacked<Term>{term});
 }
 
-// `kFrom` to `kTo` are the numbers of blocks that the term can have.
-template <int kFrom, int kTo, typename Term>
+// `kFrom` to `kTo` are the numbers of blocks that the term can have; `residuals` is kResiduals where
+// that is not ceres::DYNAMIC.
+template <int kResiduals, int kFrom, int kTo, typename Term>
 ceres::CostFunction* AutoDiff(const Term& term, int residuals, int blocks, bool dynamic) {
   if (dynamic) {
     auto* function = new ceres::DynamicAutoDiffCostFunction<Term>(new Term(term));
@@ -182,8 +185,10 @@ ceres::CostFunction* AutoDiff(const Term& term, int residuals, int blocks, bool 
     function->SetNumResiduals(residuals);
     return function;
   }
-  if (blocks == kFrom) return Templated(term, residuals, std::make_index_sequence<kFrom>());
-  if constexpr (kFrom < kTo) return AutoDiff<kFrom + 1, kTo>(term, residuals, blocks, dynamic);
+  if (blocks == kFrom)
+    return Templated<kResiduals>(term, residuals, std::make_index_sequence<kFrom>());
+  if constexpr (kFrom < kTo)
+    return AutoDiff<kResiduals, kFrom + 1, kTo>(term, residuals, blocks, dynamic);
   throw std::runtime_error("no cost function is compiled for a chain of this length");
 }
 
@@ -203,7 +208,7 @@ inline void BuildAsPaper(const Problem& problem, const Frame& frame, double* the
       if (!(measured[2] > 0) || !std::isfinite(measured[0] + measured[1])) continue;
       const auto chain = blocks(problem.landmark_bone[k], true);
       const Keypoint term{&problem, k, problem.camera_rows + 24 * camera, measured};
-      built->AddResidualBlock(AutoDiff<2, 9>(term, 2, chain.size(), dynamic), robust(), chain);
+      built->AddResidualBlock(AutoDiff<2, 2, 9>(term, 2, chain.size(), dynamic), robust(), chain);
     }
   }
   for (int imu = 0; imu < problem.imus; ++imu) {
@@ -212,7 +217,7 @@ inline void BuildAsPaper(const Problem& problem, const Frame& frame, double* the
     if (weights[1] > 0 && std::isfinite(measured[0])) {
       const auto chain = blocks(bone, false);
       const Orientation term{&problem, bone, measured};
-      built->AddResidualBlock(AutoDiff<1, 8>(term, 3, chain.size(), dynamic), nullptr, chain);
+      built->AddResidualBlock(AutoDiff<3, 1, 8>(term, 3, chain.size(), dynamic), nullptr, chain);
     }
     double known = 0;
     for (int i = 0; i < 3; ++i)
@@ -221,7 +226,7 @@ inline void BuildAsPaper(const Problem& problem, const Frame& frame, double* the
     if (weights[2] > 0 && std::isfinite(known)) {
       const auto chain = blocks(bone, true);
       const Acceleration term{&problem, frame, imu};
-      built->AddResidualBlock(AutoDiff<2, 9>(term, 3, chain.size(), dynamic), robust(), chain);
+      built->AddResidualBlock(AutoDiff<3, 2, 9>(term, 3, chain.size(), dynamic), robust(), chain);
     }
   }
   std::vector<double*> angles;
@@ -230,13 +235,14 @@ inline void BuildAsPaper(const Problem& problem, const Frame& frame, double* the
     if (!(weights[deviation ? 4 : 3] > 0)) continue;
     const int residuals = deviation ? problem.rank : problem.angles;
     const Prior term{&problem, deviation};
-    built->AddResidualBlock(AutoDiff<20, 20>(term, residuals, angles.size(), dynamic), robust(),
-                            angles);
+    auto* function =
+        AutoDiff<ceres::DYNAMIC, 20, 20>(term, residuals, angles.size(), dynamic);
+    built->AddResidualBlock(function, robust(), angles);
   }
   for (int bone : problem.floor_bone) {
     if (!(weights[5] > 0)) continue;
     const auto chain = blocks(problem.parents[bone], true);
     const Floor term{&problem, bone};
-    built->AddResidualBlock(AutoDiff<2, 9>(term, 1, chain.size(), dynamic), nullptr, chain);
+    built->AddResidualBlock(AutoDiff<1, 2, 9>(term, 1, chain.size(), dynamic), nullptr, chain);
   }
 }

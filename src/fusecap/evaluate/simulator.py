@@ -226,8 +226,10 @@ def simulate(
         default = landmark_set.offsets_m(person.shape)
         offsets_m.append(default + common * person.shape.height_m + own)
         if person.imu_bones:
+            measured_s = np.clip(times_s + imu_noise.clock_s * stream.standard_normal(), 0.0, None)
+            moving = at_times(person.theta, rate_hz, np.minimum(measured_s, times_s[-1]))
             imus[person.name] = measure(
-                stream, person.shape, person.theta, person.imu_bones, imu_noise, rate_hz
+                stream, person.shape, moving, person.imu_bones, imu_noise, rate_hz
             )
     views = []
     synchronous = _Scene(people, offsets_m, landmark_set, rate_hz, times_s)

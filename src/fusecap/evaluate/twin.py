@@ -14,7 +14,6 @@ Sequences for tuning are `twin_training_sequences`; never tune on `twin_sequence
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from typing import Literal
@@ -50,7 +49,7 @@ GroupName = Literal["duo", "quad", "bystanders", "close"]
 VOLUME_M = (-2.2, 2.2, -2.2, 2.2)
 """Of the scenes with several people: x_min, x_max, z_min, z_max; bystanders stay out of it."""
 
-TWIN_KEYPOINT_NOISE = KeypointNoise(detector_bias=0.006)
+TWIN_KEYPOINT_NOISE = KeypointNoise()
 TWIN_IMU_NOISE = ImuNoise()
 
 

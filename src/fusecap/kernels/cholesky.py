@@ -1,4 +1,9 @@
-"""Dense Cholesky factorisation and solves for the 66 x 66 normal equations."""
+"""Dense Cholesky factorisation and solves for the 66 x 66 normal equations.
+
+The factor is the L of H = Lᵀ L, found from the last row up: then every inner loop runs along rows
+of the lower triangle and counts from 0, which compiles to vector instructions. L keeps 1 / L_ii on
+its diagonal: every later use divides by it.
+"""
 
 from __future__ import annotations
 
@@ -9,60 +14,82 @@ from fusecap.kernels.jit import kernel
 
 @kernel("b1(f8[:, ::1], f8[::1], f8[:, ::1])")
 def factor(matrix, diagonal_addition, lower_out):
-    """L with L Lᵀ = matrix + diag(addition), from the lower triangle; False if not positive."""
+    """L with Lᵀ L = matrix + diag(addition), from the lower triangle; False if not positive.
+
+    Four rows are finished, then subtracted from all rows above in one pass.
+    """
     size = matrix.shape[0]
     for i in range(size):
-        row = lower_out[i]
-        for j in range(i):
-            other = lower_out[j]
-            total = matrix[i, j]
-            for k in range(j):
-                total -= row[k] * other[k]
-            row[j] = total * other[j]
-        total = matrix[i, i] + diagonal_addition[i]
-        for k in range(i):
-            total -= row[k] * row[k]
-        if not total > 0.0:
-            return False
-        # The diagonal keeps 1 / L_ii: every later use divides by it.
-        row[i] = 1.0 / math.sqrt(total)
+        for j in range(i + 1):
+            lower_out[i, j] = matrix[i, j]
+        lower_out[i, i] += diagonal_addition[i]
+    for end in range(size, 0, -4):
+        start = max(end - 4, 0)
+        for i in range(end - 1, start - 1, -1):
+            for k in range(i + 1, end):
+                share = lower_out[k, i]
+                for j in range(i + 1):
+                    lower_out[i, j] -= share * lower_out[k, j]
+            if not lower_out[i, i] > 0.0:
+                return False
+            reciprocal = 1.0 / math.sqrt(lower_out[i, i])
+            for j in range(i):
+                lower_out[i, j] *= reciprocal
+            lower_out[i, i] = reciprocal
+        for i in range(start):
+            s0, s1 = lower_out[start, i], lower_out[start + 1, i]
+            s2, s3 = lower_out[start + 2, i], lower_out[start + 3, i]
+            for j in range(i + 1):
+                lower_out[i, j] -= (
+                    s0 * lower_out[start, j]
+                    + s1 * lower_out[start + 1, j]
+                    + s2 * lower_out[start + 2, j]
+                    + s3 * lower_out[start + 3, j]
+                )
     return True
 
 
 @kernel("void(f8[:, ::1], f8[::1], f8[::1])")
 def solve_factored(lower, right, solution_out):
-    """Solve L Lᵀ x = right; `lower` holds reciprocals on its diagonal (see `factor`)."""
+    """Solve Lᵀ L x = right."""
     size = right.size
     for i in range(size):
-        total = right[i]
-        for k in range(i):
-            total -= lower[i, k] * solution_out[k]
-        solution_out[i] = total * lower[i, i]
+        solution_out[i] = right[i]
     for i in range(size - 1, -1, -1):
         value = solution_out[i] * lower[i, i]
         solution_out[i] = value
-        for k in range(i):
-            solution_out[k] -= lower[i, k] * value
+        for j in range(i):
+            solution_out[j] -= lower[i, j] * value
+    for i in range(size):
+        total = solution_out[i]
+        for j in range(i):
+            total -= lower[i, j] * solution_out[j]
+        solution_out[i] = total * lower[i, i]
 
 
 @kernel("void(f8[:, ::1], f8[:, ::1], f8[::1])")
 def inverse_diagonal(lower, inverse_scratch, diagonal_out):
-    """Diagonal of (L Lᵀ)⁻¹, by inverting L row by row."""
+    """Diagonal of (Lᵀ L)⁻¹: the squared rows of L⁻¹, each found from those above, four at a time."""
     size = lower.shape[0]
     for i in range(size):
-        diagonal_out[i] = 0.0
-    for i in range(size):
-        row = inverse_scratch[i]
-        for j in range(i):
-            row[j] = 0.0
-        for k in range(i):
-            factor_ik = lower[i, k]
-            above = inverse_scratch[k]
+        for j in range(size):
+            inverse_scratch[i, j] = 0.0
+        fours = i // 4 * 4
+        for k in range(0, fours, 4):
+            s0, s1, s2, s3 = lower[i, k], lower[i, k + 1], lower[i, k + 2], lower[i, k + 3]
+            for j in range(k + 4):
+                inverse_scratch[i, j] -= (
+                    s0 * inverse_scratch[k, j]
+                    + s1 * inverse_scratch[k + 1, j]
+                    + s2 * inverse_scratch[k + 2, j]
+                    + s3 * inverse_scratch[k + 3, j]
+                )
+        for k in range(fours, i):
             for j in range(k + 1):
-                row[j] -= factor_ik * above[j]
-        reciprocal = lower[i, i]
-        for j in range(i):
-            row[j] *= reciprocal
-        row[i] = reciprocal
+                inverse_scratch[i, j] -= lower[i, k] * inverse_scratch[k, j]
+        inverse_scratch[i, i] = 1.0
+        total = 0.0
         for j in range(i + 1):
-            diagonal_out[j] += row[j] * row[j]
+            inverse_scratch[i, j] *= lower[i, i]
+            total += inverse_scratch[i, j] * inverse_scratch[i, j]
+        diagonal_out[i] = total

@@ -235,7 +235,8 @@ def solve(
             # ½ δᵀ(μ D δ - g): the decrease that the quadratic model promises.
             predicted += 0.5 * step[i] * (damping[i] * step[i] - g[i])
             trial[i] = theta[i] + step[i]
-        if not predicted > 1e-14 * (cost + 1e-14):
+        if not predicted > function_tolerance * cost + 1e-28:
+            # Not worth an evaluation, without which no step is taken.
             status = CONVERGED
             break
         other = 1 - current
@@ -261,9 +262,6 @@ def solve(
                 status = CONVERGED
                 break
         else:
-            if predicted <= function_tolerance * cost:
-                status = CONVERGED
-                break
             mu *= growth
             growth *= 2.0
             if mu > 1e12:

@@ -94,7 +94,9 @@ def _offsets(path: Path, where: str, table: Any) -> dict[str, Offset]:
     offsets = {}
     for name, value in _table(path, f"[{where}]", table).items():
         if name not in LANDMARKS:
-            raise InputError(f"{path}: [{where}] has no landmark '{name}'{nearest(name, LANDMARKS)}")
+            raise InputError(
+                f"{path}: [{where}] has no landmark '{name}'{nearest(name, LANDMARKS)}"
+            )
         numbers = isinstance(value, list) and [
             v for v in value if isinstance(v, int | float) and not isinstance(v, bool)
         ]

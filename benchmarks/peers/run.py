@@ -1,0 +1,229 @@
+"""Ceres and SciPy beside fusecap: the same cost, the same frames, one thread, one run.
+
+    OPENBLAS_NUM_THREADS=1 taskset -c 1 uv run python benchmarks/peers/run.py [--weights paper]
+
+Prints Markdown. Needs Ceres and CMake (Debian: apt-get install libceres-dev cmake). Every
+repetition lets each solver pass over all frames; a frame's time is the median over repetitions, in
+processor time, so that other work on the machine counts little and counts for all alike.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import subprocess
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import scipy
+
+from frames import WEIGHTS, record_problems
+from fusecap.solve.pose_solver import PoseSolver
+from pose_problem import Problems, write_problems
+from scipy_peer import ScipyProblem
+
+HERE = Path(__file__).resolve().parent
+CERES_DEFAULT_DAMPING = 1e-4
+INSTALL = "on Debian: apt-get install libceres-dev cmake"
+CERES = {
+    "dynamic": "Ceres as the paper uses it, DynamicAutoDiff",
+    "templated": "Ceres as the paper uses it, templated AutoDiff",
+    "grouped": "Ceres at its best: analytic, grouped, dense",
+    "reduced": "the same, landmarks reduced over cameras first",
+}
+_CERES_COLUMNS = 7
+"""Before the pose in a row of the program's output, see ceres/main.cpp."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pass:
+    """One solver once over some frames."""
+
+    seconds: np.ndarray
+    cost: np.ndarray
+    iterations: np.ndarray
+    theta: np.ndarray
+    start_cost: np.ndarray | None = None
+    converged: float = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """One solver over all repetitions."""
+
+    name: str
+    frames: np.ndarray
+    passes: list[Pass]
+
+    @property
+    def milliseconds(self) -> np.ndarray:
+        return 1e3 * np.median([each.seconds for each in self.passes], axis=0)
+
+
+def build_ceres(folder: Path) -> Path:
+    """The compiled program; ends the run with instructions where something is missing."""
+    if shutil.which("cmake") is None:
+        raise SystemExit(f"cmake is not installed; {INSTALL}")
+    folder.mkdir(parents=True, exist_ok=True)
+    configure = ["cmake", "-S", str(HERE / "ceres"), "-B", str(folder)]
+    for command in (configure, ["cmake", "--build", str(folder)]):
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode and "CeresConfig.cmake" in done.stderr:
+            raise SystemExit(f"CMake finds no Ceres; {INSTALL}")
+        if done.returncode:
+            raise SystemExit(f"{' '.join(command)} failed:\n{done.stdout}\n{done.stderr}")
+    return folder / "ceres_peer"
+
+
+def fusecap_pass(solver: PoseSolver, problems: Problems) -> Pass:
+    data = [problems.measurements(frame) for frame in range(len(problems))]
+    solver.solve(problems.frames["start"][0], data[0])  # warm up
+    seconds, solutions = np.zeros(len(data)), []
+    for frame, start in enumerate(problems.frames["start"]):
+        before = time.process_time_ns()
+        solutions.append(solver.solve(start, data[frame]))
+        seconds[frame] = 1e-9 * (time.process_time_ns() - before)
+    return Pass(
+        seconds=seconds,
+        cost=np.array([solution.cost for solution in solutions]),
+        iterations=np.array([solution.iterations for solution in solutions]),
+        theta=np.stack([solution.theta for solution in solutions]),
+    )
+
+
+def ceres_pass(program: Path, problem_file: Path, variant: str, damping: float) -> Pass:
+    out = problem_file.with_suffix(".out")
+    subprocess.run([program, problem_file, out, variant, str(damping)], check=True)
+    rows = np.fromfile(out, "<f8").reshape(-1, _CERES_COLUMNS + 66)
+    return Pass(
+        seconds=rows[:, 4],
+        cost=rows[:, 1],
+        iterations=rows[:, 2],
+        theta=np.ascontiguousarray(rows[:, _CERES_COLUMNS:]),
+        start_cost=rows[:, 0],
+        converged=float(rows[:, 3].mean()),
+    )
+
+
+def scipy_pass(problems: Problems, frames: np.ndarray) -> Pass:
+    seconds, found = np.zeros(len(frames)), []
+    start_cost = []
+    for index, frame in enumerate(frames):
+        problem = ScipyProblem(problems, int(frame))
+        start_cost.append(0.5 * float(np.sum(problem.residuals(problem.start) ** 2)))
+        before = time.process_time_ns()
+        found.append(problem.solve())
+        seconds[index] = 1e-9 * (time.process_time_ns() - before)
+    return Pass(
+        seconds=seconds,
+        cost=np.array([result.cost for result in found]),
+        iterations=np.array([result.njev for result in found]),
+        theta=np.stack([result.x for result in found]),
+        start_cost=np.array(start_cost),
+        converged=float(np.mean([result.success for result in found])),
+    )
+
+
+def time_table(rows: list[Row]) -> str:
+    """Ratios compare medians over the frames that both solved."""
+    lines = [
+        "| solver | median ms | p99 ms | linear solves, mean | time / fusecap |",
+        "|---|---|---|---|---|",
+    ]
+    ours = rows[0].milliseconds
+    for row in rows:
+        ms = row.milliseconds
+        ratio = np.median(ms) / np.median(ours[row.frames])
+        lines.append(
+            f"| {row.name} | {np.median(ms):.3f} | {np.percentile(ms, 99):.3f} "
+            f"| {row.passes[0].iterations.mean():.2f} | {ratio:.1f} |"
+        )
+    return "\n".join(lines)
+
+
+def cost_table(rows: list[Row], solver: PoseSolver, problems: Problems) -> str:
+    lines = [
+        "| solver | at the start | at its end | end / fusecap's: min | median | max | within 1 % |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    ours = rows[0].passes[0].cost
+    for row in rows:
+        first = row.passes[0]
+        if first.start_cost is None:
+            continue
+        starts = problems.frames["start"]
+        start = _difference(solver, problems, row.frames, starts[row.frames], first.start_cost)
+        end = _difference(solver, problems, row.frames, first.theta, first.cost)
+        ratio = first.cost / ours[row.frames]
+        lines.append(
+            f"| {row.name} | {start:.0e} | {end:.0e} | {ratio.min():.5f} | {np.median(ratio):.5f} "
+            f"| {ratio.max():.5f} | {100 * np.mean(np.abs(ratio - 1) < 0.01):.1f} % |"
+        )
+    return "\n".join(lines)
+
+
+def _difference(
+    solver: PoseSolver, problems: Problems, frames: np.ndarray, theta: np.ndarray, cost: np.ndarray
+) -> float:
+    """Largest relative difference between a peer's cost and ours at the same poses."""
+    ours = [
+        solver.evaluate(pose, problems.measurements(int(frame)))[0]
+        for frame, pose in zip(frames, theta, strict=True)
+    ]
+    return float(np.abs(cost / np.array(ours) - 1).max())
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--frames", type=int, default=400)
+    parser.add_argument("--repetitions", type=int, default=7)
+    parser.add_argument("--scipy-frames", type=int, default=5)
+    parser.add_argument("--weights", choices=WEIGHTS, default="default")
+    parser.add_argument("--folder", type=Path, default=HERE.parents[1] / "out" / "peers")
+    arguments = parser.parse_args()
+
+    program = build_ceres(arguments.folder / "build")
+    version = subprocess.run(
+        [program, "--version"], check=True, capture_output=True, text=True
+    ).stdout.strip()
+    problems, solver, with_quality = record_problems(
+        frames=arguments.frames, weights=arguments.weights
+    )
+    problem_file = arguments.folder / "problems.bin"
+    write_problems(problems, problem_file)
+    damping = solver.options.initial_damping
+
+    everything = np.arange(len(problems))
+    few = np.linspace(0, len(problems) - 1, arguments.scipy_frames).astype(int)
+    rows = [Row(name="fusecap", frames=everything, passes=[])]
+    rows.append(Row(name="fusecap, with quality per bone", frames=everything, passes=[]))
+    rows += [Row(name=name, frames=everything, passes=[]) for name in CERES.values()]
+    started_as_ours = Row(name=f"{CERES['grouped']}, μ = {damping:g}", frames=everything, passes=[])
+    rows.append(started_as_ours)
+    rows.append(Row(name="SciPy least_squares", frames=few, passes=[]))
+    for _ in range(arguments.repetitions):
+        rows[0].passes.append(fusecap_pass(solver, problems))
+        rows[1].passes.append(fusecap_pass(with_quality, problems))
+        for row, variant in zip(rows[2:], CERES, strict=False):
+            row.passes.append(ceres_pass(program, problem_file, variant, CERES_DEFAULT_DAMPING))
+        started_as_ours.passes.append(ceres_pass(program, problem_file, "grouped", damping))
+    rows[-1].passes.append(scipy_pass(problems, few))
+
+    keypoints = int(np.sum(problems.frames["keypoints"][..., 2] > 0) / len(problems))
+    sizes = problems.sizes
+    print(
+        f"{len(problems)} frames, {sizes['cameras']} cameras, {sizes['landmarks']} keypoints "
+        f"({keypoints} seen per frame), {sizes['imus']} IMUs, weights: {arguments.weights}; "
+        f"Ceres {version}, SciPy {scipy.__version__}, {arguments.repetitions} repetitions\n"
+    )
+    print(time_table(rows))
+    print("\nRelative difference to fusecap's cost at equal poses, and where each solver ends:\n")
+    print(cost_table(rows, solver, problems))
+    stopped = min(row.passes[0].converged for row in rows)
+    print(f"\nSmallest share of frames that a solver ended by its tolerance: {100 * stopped:.1f} %")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,82 @@
+"""The command line: one file per command, each with its own example.
+
+Heavy imports wait until a command needs them, so `--help` is quick. Exit codes: 0 done, 1 failed,
+2 misuse, 130 interrupted. Results go to stdout, everything else to stderr; with `--json` stdout is
+one JSON object, also when the command fails.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from importlib import metadata
+from typing import Annotated
+
+import typer
+
+from fusecap.cli import calibrate_offsets, calibrate_prior, demo, doctor, export, solve
+from fusecap.cli.common import err, print_json
+from fusecap.errors import FusecapError
+
+app = typer.Typer(
+    name="fusecap",
+    epilog="Start with: fusecap demo",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+calibrate = typer.Typer(no_args_is_help=True, help="Calibrations: offsets, prior.")
+app.add_typer(calibrate, name="calibrate")
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"fusecap {metadata.version('fusecap')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Version.")
+    ] = False,
+) -> None:
+    """Full 6-DoF motion of several people from a few calibrated cameras and body-worn IMUs."""
+
+
+app.command(epilog=demo.EXAMPLE)(demo.demo)
+app.command(epilog=solve.EXAMPLE)(solve.solve)
+app.command(epilog=export.EXAMPLE)(export.export)
+app.command(epilog=doctor.EXAMPLE)(doctor.doctor)
+calibrate.command(epilog=calibrate_offsets.EXAMPLE)(calibrate_offsets.offsets)
+calibrate.command(epilog=calibrate_prior.EXAMPLE)(calibrate_prior.prior)
+
+
+def main() -> None:
+    """Entry point: errors become one readable line, never a traceback."""
+    try:
+        app()
+    except FusecapError as error:
+        _fail(str(error))
+    except KeyboardInterrupt:
+        err.print("interrupted; nothing was written")
+        sys.exit(130)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+    except Exception as error:
+        if os.environ.get("FUSECAP_DEBUG"):
+            raise
+        _fail(
+            f"internal error: {type(error).__name__}: {error}. This is a fault of fusecap; "
+            "please report it with the output of the same command under FUSECAP_DEBUG=1"
+        )
+
+
+def _fail(message: str) -> None:
+    if "--json" in sys.argv:
+        print_json({"error": message})
+    err.print("[bold red]error[/] ", end="")
+    err.print(message, markup=False, soft_wrap=True)
+    sys.exit(1)

@@ -1,0 +1,86 @@
+"""`fusecap demo`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from fusecap.cli.common import (
+    Json,
+    check_choice,
+    console,
+    finish,
+    print_json,
+    print_speed,
+    progress,
+    write_take,
+)
+
+EXAMPLE = "Example: fusecap demo --out demo --json"
+
+
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder for the take, BVH files and picture.")] = Path(
+        "demo"
+    ),
+    seconds: Annotated[
+        float | None, typer.Option(min=0.5, help="Solve only the first seconds.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of the simulated noise.")] = 0,
+    associate: Annotated[str, typer.Option(help="tracker, or paper: its Algorithm 1.")] = "tracker",
+    write_session: Annotated[
+        Path | None, typer.Option(help="Also write the scene as a session folder.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Solve a simulated scene with known truth: 2 subjects, 1 bystander, 4 cameras, 13 IMUs each.
+
+    Prints the error against the truth and the speed; writes a take, BVH files and a picture.
+    """
+    from dataclasses import asdict
+
+    from fusecap.evaluate import simulated_session
+    from fusecap.evaluate.demo_scene import demo_scene
+    from fusecap.evaluate.score import score_take
+    from fusecap.evaluate.simulated_solve import solve_simulation
+
+    check_choice("--associate", associate, ("tracker", "paper"))
+    simulation = demo_scene(seed, seconds=seconds)
+    if write_session:
+        simulated_session.write_session(simulation, write_session)
+    with progress(quiet=as_json) as show:
+        solved = solve_simulation(simulation, associate=associate, progress=show)
+    files = write_take(solved.take, out / "demo.npz", exports=["bvh"], unit="m", picture=True)
+    score = score_take(solved.take, simulation.truth)
+    result = {
+        "simulated": True,
+        "position_error_mm": score.position_error_mm.mean,
+        "orientation_error_deg": score.orientation_error_deg.mean,
+        "solve_ms_median": solved.report.solve_ms_median,
+        "solve_ms_p99": solved.report.solve_ms_p99,
+        "subjects": score.subjects,
+        "identity_switches": score.identity_switches,
+        "found_share": score.found_share,
+        "extra_share": score.extra_share,
+        "score": asdict(score),
+        "solve": solved.report.as_json(),
+        "files": [str(path) for path in files],
+    }
+    if as_json:
+        print_json(result)
+    else:
+        console.print("[bold]Simulated scene[/]: 2 subjects, 1 bystander, 4 cameras, 13 IMUs each")
+        console.print(f"  position error     {_spread(score.position_error_mm)} mm")
+        console.print(f"  orientation error  {_spread(score.orientation_error_deg)} deg")
+        console.print(
+            f"  people             {score.subjects} subjects, {score.identity_switches} identity "
+            f"switches, {100 * score.found_share:.1f} % of their frames found"
+        )
+        print_speed(solved)
+    finish(solved, files, as_json)
+
+
+def _spread(summary: Any) -> str:
+    return f"{summary.mean:.1f} mean, {summary.median:.1f} median, {summary.std:.1f} std"

@@ -1,0 +1,104 @@
+"""`fusecap solve`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fusecap.cli.common import (
+    EXPORTS,
+    Json,
+    SessionPath,
+    Unit,
+    check_choice,
+    console,
+    err,
+    finish,
+    print_json,
+    print_speed,
+    progress,
+    write_take,
+)
+from fusecap.errors import InputError
+
+if TYPE_CHECKING:
+    from fusecap.offline import Solved
+
+EXAMPLE = "Example: fusecap solve recordings/duo --export bvh --json > report.json"
+
+
+def solve(
+    session: SessionPath,
+    out: Annotated[
+        Path | None, typer.Option(help="The take to write; default SESSION/<name>.npz.")
+    ] = None,
+    export: Annotated[
+        str | None, typer.Option(help="Other formats beside the take, e.g. bvh.")
+    ] = None,
+    unit: Unit = "m",
+    picture: Annotated[bool, typer.Option("--picture", help="Also draw the motion.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Solve a recorded session: keypoints and IMU files to each person's motion."""
+    from fusecap.offline import solve_session
+    from fusecap.sinks.files import safe_name
+    from fusecap.sources.session import load_session
+    from fusecap.sources.session_data import open_session
+
+    formats = _formats(export)
+    check_choice("--unit", unit, ("m", "cm"))
+    loaded = load_session(session)
+    target = out or loaded.folder / f"{safe_name(loaded.settings.name)}.npz"
+    if target.suffix != ".npz":
+        raise InputError(f"--out {target}: a take is one .npz file")
+    with progress(quiet=as_json) as show:
+        data = open_session(loaded, show)
+        solved = solve_session(data, progress=show)
+    files = write_take(solved.take, target, exports=formats, unit=unit, picture=picture)
+    if as_json:
+        print_json(solved.report.as_json() | {"files": [str(path) for path in files]})
+    else:
+        for note in solved.report.notes:
+            err.print(f"[yellow]note[/] {note}", soft_wrap=True)
+        _print_report(solved)
+    finish(solved, files, as_json)
+
+
+def _formats(text: str | None) -> list[str]:
+    """The names of a comma-separated list, each checked."""
+    formats = [part.strip() for part in (text or "").split(",") if part.strip()]
+    for name in formats:
+        check_choice("--export", name, EXPORTS)
+    return formats
+
+
+def _print_report(solved: Solved) -> None:
+    from rich.table import Table
+
+    report = solved.report
+    console.print(
+        f"[bold]{report.instants}[/] instants ({report.duration_s:.2f} s), "
+        f"{report.cameras} cameras, {len(report.subjects)} subjects"
+    )
+    people = Table("subject", "tracked", "quality", "height m")
+    for name, values in report.subjects.items():
+        people.add_row(
+            name,
+            f"{100 * values['tracked_share']:.1f} %",
+            f"{values['mean_quality']:.2f}",
+            f"{values['height_m']:.2f}",
+        )
+    console.print(people)
+    if report.reprojection_px:
+        cameras = Table("camera", "reprojection median px", "p90 px", "keypoints")
+        for name, values in report.reprojection_px.items():
+            cameras.add_row(
+                name,
+                f"{values['median']:.1f}",
+                f"{values['p90']:.1f}",
+                f"{values['keypoints']:.0f}",
+            )
+        console.print(cameras)
+    print_speed(solved)

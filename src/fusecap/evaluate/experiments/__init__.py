@@ -1,0 +1,1 @@
+"""The paper's experiments of section 4 on the simulated twin; one file per experiment."""

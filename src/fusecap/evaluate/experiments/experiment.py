@@ -1,0 +1,156 @@
+"""What an experiment is: cells to solve, then tables, plots and findings made of their results.
+
+settings ──cells()──▶ grid runner ──Results──▶ report() ──▶ Markdown, CSV, JSON, PNG
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from fusecap.errors import InputError, nearest
+from fusecap.evaluate.cells import TwinCell
+from fusecap.evaluate.runner import Outcome
+from fusecap.evaluate.tables import Table
+from fusecap.evaluate.twin import twin_sequences
+from fusecap.solve.options import Weights
+
+WEIGHTS: Mapping[str, Weights] = {"default": Weights(), "paper": Weights.paper()}
+"""The solver's own weights, or the paper's as printed: the same, and acceleration at 1e-3."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """What the user may choose."""
+
+    sequences: tuple[str, ...]
+    seed: int = 0
+    quick: bool = False
+    """Fewer sequences and configurations, to see that it runs."""
+    weights: str = "default"
+
+    def cell(self, scene: str, **changes: Any) -> TwinCell:
+        """A cell of the twin under these settings; `weights=` changes single ones."""
+        weights = asdict(WEIGHTS[self.weights]) | dict(changes.pop("weights", {}))
+        return TwinCell(scene=scene, seed=self.seed, weights=weights, **changes)
+
+
+def settings(
+    *, sequences: str | None, seed: int, quick: bool, weights: str = "default"
+) -> Settings:
+    """Settings from the command line; raises `InputError` for an unknown sequence."""
+    known = [sequence.key for sequence in twin_sequences()]
+    chosen = [name.strip() for name in sequences.split(",")] if sequences else known
+    for name in chosen:
+        if name not in known:
+            raise InputError(f"the twin has no sequence '{name}'{nearest(name, known)}")
+    return Settings(
+        sequences=tuple(chosen[:2] if quick else chosen), seed=seed, quick=quick, weights=weights
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """Something the paper found, and whether the twin shows it."""
+
+    statement: str
+    evidence: str
+    holds: bool | None
+    """None: it could not be decided."""
+    why: str = ""
+    """What is known about the reason where it does not hold."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """What an experiment says."""
+
+    tables: tuple[Table, ...]
+    findings: tuple[Finding, ...] = ()
+    plots: Mapping[str, Figure] = field(default_factory=dict)
+    """By the end of their file names."""
+
+
+class Results:
+    """Results by cell; a failed cell has none."""
+
+    def __init__(self, outcomes: Iterable[Outcome]) -> None:
+        self._by_cell = {repr(outcome.cell): outcome.result for outcome in outcomes}
+
+    def of(self, cell: TwinCell) -> dict[str, Any] | None:
+        """What came of one cell; None where it failed."""
+        return self._by_cell.get(repr(cell))
+
+    def mean(self, cells: Iterable[TwinCell], *path: str) -> float:
+        """Mean of one number over the cells that have it, e.g. "score", "idf1"."""
+        return _mean([number(self.of(cell), *path) for cell in cells])
+
+    def spread(self, cells: Iterable[TwinCell], *path: str) -> Spread:
+        """A `Summary` pooled over cells of equal length, e.g. "score", "position_error_mm"."""
+        each = [
+            [number(self.of(cell), *path, part) for part in ("mean", "std", "median", "mad")]
+            for cell in cells
+        ]
+        mean, std, median, mad = (np.array(column) for column in zip(*each, strict=True))
+        pooled = _mean(mean)
+        return Spread(
+            mean=pooled,
+            std=math.sqrt(max(_mean(std**2 + mean**2) - pooled**2, 0.0)),
+            median=_mean(median),
+            mad=_mean(mad),
+            across=float(np.nanstd(mean)) if np.isfinite(mean).any() else math.nan,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spread:
+    """Errors over several sequences."""
+
+    mean: float
+    std: float
+    """Over all bones and frames."""
+    median: float
+    """Mean of the sequences' medians; so is `mad`."""
+    mad: float
+    across: float
+    """Standard deviation of the sequences' means."""
+
+
+def number(result: Any, *path: str) -> float:
+    """The number at a path of names in a result; NaN where it is missing."""
+    for name in path:
+        result = result.get(name) if isinstance(result, Mapping) else None
+    return float(result) if isinstance(result, int | float) else math.nan
+
+
+def _mean(values: Sequence[float] | np.ndarray) -> float:
+    known = np.array(values, dtype=np.float64)
+    known = known[np.isfinite(known)]
+    return float(known.mean()) if len(known) else math.nan
+
+
+def below(small: float, large: float, factor: float = 1.0) -> bool | None:
+    """Whether `small` < `factor` x `large`; None where either is unknown."""
+    return small < factor * large if math.isfinite(small + large) else None
+
+
+def both(*facts: bool | None) -> bool | None:
+    """Whether all hold; None where one that matters is unknown."""
+    if False in facts:
+        return False
+    return None if None in facts else True
+
+
+@dataclass(frozen=True, kw_only=True)
+class Experiment:
+    """One of the paper's tables or figures."""
+
+    name: str
+    title: str
+    cells: Callable[[Settings], list[TwinCell]]
+    report: Callable[[Settings, Results], Report]

@@ -1,0 +1,85 @@
+"""Table 2: sparse input, with Procrustes alignment [1, sec. 4.1.1]."""
+
+from __future__ import annotations
+
+from fusecap.evaluate.cells import TwinCell
+from fusecap.evaluate.experiments.experiment import (
+    Experiment,
+    Finding,
+    Report,
+    Results,
+    Settings,
+    below,
+    both,
+)
+from fusecap.evaluate.tables import Table
+
+ROWS = {
+    "0 cameras, 6 IMUs": (0, 6, "68.6 (55.1)", "18.5 (15.9)"),
+    "1 camera, 13 IMUs": (1, 13, "19.2 (14.9)", "7.7 (6.0)"),
+}
+"""Cameras, IMUs, and the paper's "Proposed": position [mm], orientation [deg], aligned."""
+OTHERS = {"0 cameras, 6 IMUs": "DIP: 59.6, 15.8", "1 camera, 13 IMUs": "VIP: 26.0, 12.1"}
+
+
+def _row(settings: Settings, cameras: int, imus: int) -> list[TwinCell]:
+    return [settings.cell(scene, cameras=cameras, imus=imus) for scene in settings.sequences]
+
+
+def cells(settings: Settings) -> list[TwinCell]:
+    return [
+        settings.cell(scene, cameras=cameras, imus=imus)
+        for scene in settings.sequences
+        for cameras, imus, _, _ in ROWS.values()
+    ]
+
+
+def report(settings: Settings, results: Results) -> Report:
+    rows, findings = [], []
+    for name, (cameras, imus, paper_mm, paper_deg) in ROWS.items():
+        chosen = _row(settings, cameras, imus)
+        place = results.spread(chosen, "score", "aligned_error_mm")
+        turn = results.spread(chosen, "score", "aligned_orientation_error_deg")
+        rows.append(
+            (
+                name,
+                f"{place.mean:.1f} ({place.std:.1f})",
+                f"{turn.mean:.1f} ({turn.std:.1f})",
+                paper_mm,
+                paper_deg,
+                OTHERS[name],
+            )
+        )
+        findings.append(
+            Finding(
+                statement=f"{name}: no more than 1.25 times the paper's errors, {paper_mm} mm and "
+                f"{paper_deg} deg",
+                evidence=f"{place.mean:.1f} mm, {turn.mean:.1f} deg",
+                holds=both(
+                    below(place.mean, float(paper_mm.split()[0]), 1.25),
+                    below(turn.mean, float(paper_deg.split()[0]), 1.25),
+                ),
+            )
+        )
+    return Report(
+        tables=(
+            Table(
+                title="Table 2: mean error (std) with Procrustes alignment",
+                columns=(
+                    "input",
+                    "position mm",
+                    "orientation deg",
+                    "paper, real data mm",
+                    "paper, real data deg",
+                    "others, real data mm, deg",
+                ),
+                rows=tuple(rows),
+            ),
+        ),
+        findings=tuple(findings),
+    )
+
+
+TABLE2 = Experiment(
+    name="table2", title="Table 2: sparse input, aligned", cells=cells, report=report
+)
