@@ -16,6 +16,7 @@ from fusecap.evaluate.simulated_session import write_session
 from fusecap.evaluate.simulated_solve import solve_simulation
 from fusecap.offline import Solved, solve_session
 from fusecap.sinks.take import load_take
+from fusecap.sources.doctor import diagnose
 from fusecap.sources.session import load_session
 from fusecap.sources.session_data import open_session
 
@@ -219,6 +220,15 @@ def test_a_mirrored_calibration_finds_nobody_rather_than_mirrored_people(folder)
     solved = solve(folder)
     assert not solved.take.tracked.any()
     assert solved.report.notes
+
+
+def test_wearers_without_start_positions_are_pointed_out(folder):
+    file = folder / "session.toml"
+    lines = file.read_text().splitlines()
+    file.write_text("\n".join(line for line in lines if not line.startswith("start_m")))
+    data = open_session(load_session(folder))
+    assert any("start_m" in finding.remedy for finding in data.findings)
+    assert any("start_m" in finding.remedy for finding in diagnose(folder))
 
 
 def test_two_subjects_with_one_name_are_refused(folder):

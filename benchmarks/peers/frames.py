@@ -18,11 +18,12 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from pose_problem import Problems, build_problems, write_problems
+from solve_scene import scene
+
 from fusecap.solve.estimator import Estimator
 from fusecap.solve.options import SolverOptions, Weights
 from fusecap.solve.pose_solver import Measurements, PoseSolver, Solution
-from pose_problem import Problems, build_problems, write_problems
-from solve_scene import scene
 
 FLOOR_BONES = ("left_foot", "left_toes", "right_foot", "right_toes")
 WEIGHTS = {"default": Weights(), "paper": Weights.paper()}

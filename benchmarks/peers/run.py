@@ -18,11 +18,11 @@ from pathlib import Path
 
 import numpy as np
 import scipy
-
 from frames import WEIGHTS, record_problems
-from fusecap.solve.pose_solver import PoseSolver
 from pose_problem import Problems, write_problems
 from scipy_peer import ScipyProblem
+
+from fusecap.solve.pose_solver import PoseSolver
 
 HERE = Path(__file__).resolve().parent
 CERES_DEFAULT_DAMPING = 1e-4

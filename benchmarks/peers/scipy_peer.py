@@ -7,10 +7,9 @@ is therefore handed over as r √(log(1 + s)/s), whose square is the robust cost
 from __future__ import annotations
 
 import numpy as np
+from pose_problem import Problems
 from scipy.optimize import OptimizeResult, least_squares
 from scipy.spatial.transform import Rotation
-
-from pose_problem import Problems
 
 _UNSEEN_PX = 1920.0
 _NEAR_M = 0.05

@@ -159,7 +159,7 @@ def calibrate_session(
     """Offsets from the first three quarters of a session, checked on the rest.
 
     With `truth`, its poses are used throughout. Without, instants are solved, and the check solves
-    the held-out ones with the old and with the new offsets. Raises `InputError` where the session
+    the session with the old and with the new offsets. Raises `InputError` where the session
     has fewer than two cameras or nobody can be measured.
     """
     if data.landmarks is None or len(data.rig) < 2:
@@ -177,9 +177,9 @@ def calibrate_session(
     train = [data.detections(instant) for instant in range(trained)]
     held_out = [data.detections(instant) for instant in range(trained, instants)]
 
-    def solve(landmarks: LandmarkSet, first: int, end: int) -> Take:
+    def solve(landmarks: LandmarkSet, end: int) -> Take:
         scene = scene_of(data, landmarks)
-        return solve_instants(scene, SessionInstants(data, first, end), progress=progress).take
+        return solve_instants(scene, SessionInstants(data, 0, end), progress=progress).take
 
     if truth is not None:
         samples = measure_offsets(rig, landmarks, truth, train)
@@ -197,14 +197,14 @@ def calibrate_session(
         before = after = truth
     else:
         found = self_calibrate(
-            lambda landmarks: solve(landmarks, 0, trained),
+            lambda landmarks: solve(landmarks, trained),
             rig,
             landmarks,
             train,
             per_subject=per_subject,
         )
-        before = solve(landmarks, trained, instants)
-        after = solve(found.landmarks, trained, instants)
+        before = solve(landmarks, instants)
+        after = solve(found.landmarks, instants)
     height_m = float(np.mean(before.heights_m)) if len(before.heights_m) else 0.0
     return OffsetCalibration(
         landmarks=found.landmarks,

@@ -14,7 +14,15 @@ from typing import Annotated
 
 import typer
 
-from fusecap.cli import calibrate_offsets, calibrate_prior, demo, doctor, export, solve
+from fusecap.cli import (
+    calibrate_offsets,
+    calibrate_prior,
+    demo,
+    doctor,
+    evaluate_twin,
+    export,
+    solve,
+)
 from fusecap.cli.common import err, print_json
 from fusecap.errors import FusecapError
 
@@ -28,6 +36,8 @@ app = typer.Typer(
 )
 calibrate = typer.Typer(no_args_is_help=True, help="Calibrations: offsets, prior.")
 app.add_typer(calibrate, name="calibrate")
+evaluate = typer.Typer(no_args_is_help=True, help="The paper's tables and figures.")
+app.add_typer(evaluate, name="evaluate")
 
 
 def _print_version(asked: bool) -> None:
@@ -51,6 +61,7 @@ app.command(epilog=export.EXAMPLE)(export.export)
 app.command(epilog=doctor.EXAMPLE)(doctor.doctor)
 calibrate.command(epilog=calibrate_offsets.EXAMPLE)(calibrate_offsets.offsets)
 calibrate.command(epilog=calibrate_prior.EXAMPLE)(calibrate_prior.prior)
+evaluate_twin.add_to(evaluate)
 
 
 def main() -> None:

@@ -61,15 +61,16 @@ def _print_report(found: OffsetCalibration) -> None:
     if not found.with_truth and not found.converged:
         how += f" (not converged: the last one moved offsets by {found.step_mm[-1]:.1f} mm)"
     console.print(f"{found.person_frames} person-frames, {how}")
-    table = Table("landmark", "bone", "x left mm", "y up mm", "z forward mm")
-    table.add_column("moved mm", justify="right")
-    table.add_column("spread mm", justify="right")
-    table.add_column("samples", justify="right")
+    table = Table("landmark", "bone", "x, y, z mm", "moved mm", "spread mm", "samples")
+    for column in table.columns:
+        column.no_wrap = True
+    for column in table.columns[2:]:
+        column.justify = "right"
     for row in found.rows:
         table.add_row(
             row.landmark,
             row.bone,
-            *(f"{value:.1f}" for value in row.offset_mm),
+            " ".join(f"{value:6.1f}" for value in row.offset_mm),
             f"{row.moved_mm:.1f}",
             f"{max(row.mad_mm):.1f}",
             str(row.samples),
@@ -78,5 +79,6 @@ def _print_report(found: OffsetCalibration) -> None:
     before, after = found.held_out_before_px, found.held_out_after_px
     console.print(
         f"  held-out instants  reprojection {before.median:.2f} -> {after.median:.2f} px median, "
-        f"{before.mean:.2f} -> {after.mean:.2f} px mean, {after.count} keypoints"
+        f"{before.mean:.2f} -> {after.mean:.2f} px mean, {after.count} keypoints",
+        soft_wrap=True,
     )

@@ -28,6 +28,7 @@ from fusecap.sources.session_data import (
     mount,
     open_rig,
     solve_times_s,
+    unplaced_wearers,
 )
 
 SAMPLED_INSTANTS = 60
@@ -61,6 +62,7 @@ def diagnose(path: Path | str, progress: Progress | None = None) -> list[Finding
     tracks = _check_keypoints(session, rig, findings, progress)
     imus = _check_imus(session, findings)
     _check_amount(session, tracks, findings)
+    findings += unplaced_wearers(session)
     complete = len(tracks) == len(session.cameras) and all(
         track is not None for track in (*tracks.values(), *imus)
     )

@@ -115,6 +115,7 @@ def open_session(session: Session, progress: Progress | None = None) -> SessionD
     for track in keypoints:
         if track.broken:
             findings.append(broken_files(track))
+    findings += unplaced_wearers(session)
     tracks = {}
     for subject in session.subjects:
         tracks[subject.name] = open_imus(subject)
@@ -153,6 +154,23 @@ def open_session(session: Session, progress: Progress | None = None) -> SessionD
         findings=tuple(findings),
         content_hash=content_hash(session),
     )
+
+
+def unplaced_wearers(session: Session) -> list[Finding]:
+    """People who wear sensors but could be anyone the cameras find first."""
+    if not session.cameras or len(session.subjects) < 2:
+        return []
+    names = [s.name for s in session.subjects if s.imus and s.start_m is None]
+    if not names:
+        return []
+    return [
+        Finding(
+            severity="warning",
+            where="subjects",
+            found=f"{', '.join(names)}: sensors, but no start position to tell them apart by",
+            remedy="add start_m = [x, z], or sensors may be taken for another person's",
+        )
+    ]
 
 
 def open_rig(session: Session) -> tuple[Rig, list[Finding]]:

@@ -1,6 +1,7 @@
 """Table 4's protocol on the twin: 4 cameras, and one, without IMUs, over 17 joints [1, sec. 4.1.3].
 
-Human3.6M has four cameras in the corners of a room; so has every other one of the ring. Global position with four cameras, Procrustes alignment with one.
+Human3.6M has four cameras in the corners of a room; so has every other one of the ring. Global
+position with four cameras, Procrustes alignment with one.
 """
 
 from __future__ import annotations
