@@ -19,10 +19,11 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+from solve_scene import KnownSorter, Scene, scene
+
 from fusecap.body.skeleton import EXTENDED23
 from fusecap.evaluate.imu_noise import IMUS_6
 from fusecap.pipeline import Pipeline
-from solve_scene import KnownSorter, Scene, scene
 
 PASSES = 3
 

@@ -21,10 +21,11 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+from solve_scene import Scene, scene
+
 from fusecap.kernels import solve as kernels
 from fusecap.solve.pose_solver import Measurements
 from fusecap.types import Observation
-from solve_scene import Scene, scene
 
 PASSES = 3
 

@@ -31,9 +31,9 @@ from fusecap.evaluate.metrics import correct_limbs, identity_switches, match_peo
 from fusecap.evaluate.shelf import ACTORS, LIMBS, load_truth, score_shelf
 
 FRAMES = 150
-POSE2SIM_NAMES = (
-    "RAnkle RKnee RHip LHip LKnee LAnkle RWrist RElbow RShoulder LShoulder LElbow LWrist"
-).split()
+_LEGS = ("RAnkle", "RKnee", "RHip", "LHip", "LKnee", "LAnkle")
+_ARMS = ("RWrist", "RElbow", "RShoulder", "LShoulder", "LElbow", "LWrist")
+POSE2SIM_NAMES = _LEGS + _ARMS
 """In the order of Shelf's joints 0-11."""
 BODY25_TREE = {
     ("CHip", 8): {
@@ -103,7 +103,8 @@ def read_people(paths: list[Path]) -> np.ndarray:
         lines = path.read_text().splitlines()
         names = [name for name in lines[3].split("\t")[2:] if name.strip()]
         rows = np.array([[float(x) for x in line.split("\t") if x.strip()] for line in lines[5:]])
-        marker = dict(zip(names, np.moveaxis(rows[:, 2:].reshape(len(rows), -1, 3), 1, 0)))
+        columns = rows[:, 2:].reshape(len(rows), len(names), 3)
+        marker = {name: columns[:, index] for index, name in enumerate(names)}
         points = np.full((len(rows), 15, 3), np.nan)
         points[:, :12] = np.stack([marker[name] for name in POSE2SIM_NAMES], axis=1)
         hips = (points[:, 2] + points[:, 3]) / 2

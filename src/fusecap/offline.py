@@ -12,63 +12,23 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
-from fusecap.associate.paper import PaperSorter
-from fusecap.associate.subjects import Subject
-from fusecap.associate.tracker import Tracker, TrackerOptions
-from fusecap.body.landmarks import LANDMARK_SETS, LandmarkSet
-from fusecap.body.prior import PosePrior, load_prior
-from fusecap.body.shape import REFERENCE_HEIGHT_M, BodyShape
-from fusecap.body.skeleton import Skeleton
-from fusecap.errors import SessionError
-from fusecap.geometry.camera import Rig
-from fusecap.pipeline import Pipeline, Sorter, observation_of
+from fusecap.body.shape import BodyShape
+from fusecap.pipeline import Pipeline, observation_of
+from fusecap.scene import Instants, Scene, SessionInstants, scene_of
 from fusecap.sinks.take import Take, TakeBuilder, provenance
-from fusecap.solve.estimator import SubjectModel
-from fusecap.solve.options import SolverOptions, Weights
-from fusecap.solve.pose_solver import ImuSites
 from fusecap.solve.reprojection import Reprojection
-from fusecap.sources.session import Session, SubjectSettings
 from fusecap.sources.session_data import SessionData
 from fusecap.types import Detections, Estimate, ImuReading, TrackState, TrackUpdate
 
 Progress = Callable[[str, int, int], None]
 """Called with (what is being done, instants done, instants in all)."""
-
-
-class Instants(Protocol):
-    """Recorded measurements on the solve's instants."""
-
-    def __len__(self) -> int: ...
-
-    def detections(self, instant: int) -> Detections:
-        """Everyone in every camera."""
-        ...
-
-    def readings(self, instant: int) -> Mapping[str, ImuReading]:
-        """By subject name, what its sensors say."""
-        ...
-
-
-@dataclass(frozen=True, kw_only=True)
-class Scene:
-    """Who is in front of which cameras."""
-
-    rig: Rig
-    landmarks: LandmarkSet
-    skeleton: Skeleton
-    rate_hz: float
-    subjects: tuple[SubjectModel, ...]
-    sorter: Sorter | None
-    """None without cameras."""
-    prior: PosePrior
-    options: SolverOptions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,7 +102,7 @@ def solve_instants(
         builder = TakeBuilder(
             skeleton=scene.skeleton,
             rate_hz=scene.rate_hz,
-            subject_names=[model.name for model in scene.subjects],
+            subject_names=_in_order([model.name for model in scene.subjects], tracked.shapes),
             provenance=provenance(
                 options={"solver": asdict(scene.options), "cameras": list(scene.rig.names)},
                 session_sha256=session_sha256,
@@ -186,116 +146,6 @@ def solve_instants(
     )
 
 
-def scene_of(data: SessionData, landmarks: LandmarkSet | None = None) -> Scene:
-    """What a session file says about people, cameras and options, as the stages want it.
-
-    `landmarks` are the session's own unless given.
-    """
-    session = data.session
-    settings = session.settings
-    options = solver_options(session)
-    landmarks = landmarks or data.landmarks or LANDMARK_SETS["body25"]
-    sites = {
-        imus.subject: ImuSites(
-            bone=tuple(session.skeleton.bone(name) for name in imus.bones),
-            position_m=np.ascontiguousarray(imus.positions_in_bone_m, dtype=np.float64),
-        )
-        for imus in data.imus
-    }
-    subjects = tuple(
-        SubjectModel(
-            name=subject.name,
-            shape=_shape(session.skeleton, subject, measurable=len(data.rig) > 1),
-            sites=sites.get(subject.name, ImuSites.none()),
-            start_m=subject.start_m,
-        )
-        for subject in session.subjects
-    )
-    return Scene(
-        rig=data.rig,
-        landmarks=landmarks,
-        skeleton=session.skeleton,
-        rate_hz=settings.rate_hz,
-        subjects=subjects,
-        sorter=make_sorter(
-            data.rig,
-            landmarks,
-            subjects,
-            associate=settings.associate,
-            max_subjects=settings.max_subjects,
-            volume_m=settings.volume_m,
-        ),
-        prior=load_prior(session.skeleton),
-        options=options,
-    )
-
-
-def make_sorter(
-    rig: Rig,
-    landmarks: LandmarkSet,
-    subjects: Sequence[SubjectModel],
-    *,
-    associate: str = "tracker",
-    max_subjects: int | None = None,
-    volume_m: tuple[float, float, float, float] | None = None,
-) -> Sorter | None:
-    """The sorter a session asks for; None without cameras."""
-    if not len(rig):
-        return None
-    named = [Subject(name=model.name, start_m=model.start_m) for model in subjects]
-    if associate == "paper":
-        if len(rig) < 2:
-            raise SessionError('associate = "paper" triangulates; it needs two cameras or more')
-        return PaperSorter(rig, landmarks, named)
-    if len(rig) == 1 and max_subjects is None and len(named) <= 1:
-        max_subjects = 1
-    return Tracker(
-        rig, landmarks, TrackerOptions(max_subjects=max_subjects, volume_m=volume_m), named
-    )
-
-
-def solver_options(session: Session) -> SolverOptions:
-    """Defaults with what `[estimator]` and `floor` change."""
-    given = session.estimator
-    weights = {name: w for name, w in given.weights.model_dump().items() if w is not None}
-    if not session.settings.floor:
-        weights["floor"] = 0.0
-    named = {
-        name: value
-        for name in ("max_iterations", "function_tolerance", "floor_radius_m")
-        if (value := getattr(given, name)) is not None
-    }
-    return SolverOptions(weights=Weights.named(**weights), **named)
-
-
-def _shape(skeleton: Skeleton, subject: SubjectSettings, *, measurable: bool) -> BodyShape | None:
-    """Measured, scaled, or None: to be estimated from two views or more."""
-    if subject.height_m is None and not subject.bone_lengths_m and measurable:
-        return None
-    shape = BodyShape.from_height(skeleton, subject.height_m or REFERENCE_HEIGHT_M)
-    return shape.with_lengths(subject.bone_lengths_m)
-
-
-class SessionInstants:
-    """The instants `first` to `end` (excluded) of an opened session; all of them unless told."""
-
-    def __init__(self, data: SessionData, first: int = 0, end: int | None = None) -> None:
-        self._data = data
-        self._instants = range(len(data.times_s))[first:end]
-
-    def __len__(self) -> int:
-        return len(self._instants)
-
-    def detections(self, instant: int) -> Detections:
-        """Everyone in every camera."""
-        return self._data.detections(self._instants[instant])
-
-    def readings(self, instant: int) -> Mapping[str, ImuReading]:
-        """By subject name, what its sensors say."""
-        row = self._instants[instant]
-        return {imus.subject: imus.reading(row) for imus in self._data.imus}
-
-
 @dataclass(frozen=True, kw_only=True)
 class _Tracked:
     """What the first pass leaves: per instant the updates of people who became subjects."""
@@ -303,6 +153,11 @@ class _Tracked:
     updates: list[list[TrackUpdate]]
     shapes: dict[str, BodyShape]
     interrupted: bool
+
+
+def _in_order(named: list[str], found: Collection[str]) -> list[str]:
+    """Named subjects as the session lists them, then person1, person2, ... person10."""
+    return named + sorted(set(found) - set(named), key=lambda name: (len(name), name))
 
 
 def _first_pass(pipeline: Pipeline, instants: Instants, progress: Progress | None) -> _Tracked:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fusecap.cli.common import Json, SessionPath, console, print_json, progress
+from fusecap.cli.common import Json, SessionPath, console, err, print_json, progress
 
 if TYPE_CHECKING:
     from fusecap.calibrate.offsets import OffsetCalibration
@@ -58,18 +58,17 @@ def _print_report(found: OffsetCalibration) -> None:
     from rich.table import Table
 
     how = "the truth's poses" if found.with_truth else f"{len(found.step_mm)} rounds of solves"
-    if not found.with_truth and not found.converged:
-        how += f" (not converged: the last one moved offsets by {found.step_mm[-1]:.1f} mm)"
+    if found.step_mm and not found.converged:
+        how += f" (the last one still moved offsets by {found.step_mm[-1]:.1f} mm)"
     console.print(f"{found.person_frames} person-frames, {how}")
-    table = Table("landmark", "bone", "x, y, z mm", "moved mm", "spread mm", "samples")
+    table = Table("landmark", "x, y, z on its bone mm", "moved", "spread", "samples")
     for column in table.columns:
         column.no_wrap = True
-    for column in table.columns[2:]:
+    for column in table.columns[1:]:
         column.justify = "right"
     for row in found.rows:
         table.add_row(
             row.landmark,
-            row.bone,
             " ".join(f"{value:6.1f}" for value in row.offset_mm),
             f"{row.moved_mm:.1f}",
             f"{max(row.mad_mm):.1f}",
@@ -77,6 +76,12 @@ def _print_report(found: OffsetCalibration) -> None:
         )
     console.print(table)
     before, after = found.held_out_before_px, found.held_out_after_px
+    if not after.median < before.median:
+        err.print(
+            "[yellow]note[/] the held-out instants are not explained better than before; "
+            "do not use these offsets",
+            soft_wrap=True,
+        )
     console.print(
         f"  held-out instants  reprojection {before.median:.2f} -> {after.median:.2f} px median, "
         f"{before.mean:.2f} -> {after.mean:.2f} px mean, {after.count} keypoints",

@@ -116,7 +116,9 @@ def _print(evaluation: Evaluation, files: list[Path]) -> None:
         console.print(f"[{colours[finding.holds]}]{words[finding.holds]}[/] ", end="")
         console.print(f"{finding.statement}: {finding.evidence}", markup=False, soft_wrap=True)
     for table in evaluation.report.tables:
-        shown = RichTable(*table.columns, title=table.title, title_justify="left")
+        shown = RichTable(title=table.title, title_justify="left")
+        for column in table.columns:
+            shown.add_column(column, overflow="fold")
         for row in table.rows:
             shown.add_row(*[table.shown(value) for value in row])
         console.print(shown)

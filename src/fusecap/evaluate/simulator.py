@@ -31,6 +31,7 @@ from fusecap.evaluate.keypoint_noise import (
     detector_bias,
     together,
 )
+from fusecap.evaluate.rig_noise import RigNoise, believed
 from fusecap.geometry.camera import Camera, Rig
 from fusecap.sinks.take import Take, provenance, take_from_theta
 from fusecap.sources.keypoint_files import KeypointTrack
@@ -91,6 +92,7 @@ class Simulation:
 
     name: str
     rig: Rig
+    """As calibrated."""
     landmark_set: LandmarkSet
     people: tuple[Person, ...]
     rate_hz: float
@@ -198,6 +200,7 @@ def simulate(
     seed: int,
     keypoint_noise: KeypointNoise | None = None,
     imu_noise: ImuNoise | None = None,
+    rig_noise: RigNoise | None = None,
     name: str = "simulation",
     volume_m: tuple[float, float, float, float] | None = None,
     timing: Sequence[CameraTiming] | None = None,
@@ -205,6 +208,7 @@ def simulate(
 ) -> Simulation:
     """Capture `people` in motion, all over the same frames; the same seed gives the same bits.
 
+    `rig` is where the cameras are; the capture's own is as a calibration with `rig_noise` has it.
     `timing` has one entry per camera; by default all expose at the motion's instants.
     """
     keypoint_noise = keypoint_noise or KeypointNoise()
@@ -214,7 +218,7 @@ def simulate(
     timing = timing or [CameraTiming(rate_hz=rate_hz)] * len(rig)
     if len(timing) != len(rig):
         raise InputError(f"{len(timing)} camera timings for {len(rig)} cameras")
-    streams = np.random.default_rng(seed).spawn(1 + len(rig) + len(people))
+    *streams, of_rig = np.random.default_rng(seed).spawn(2 + len(rig) + len(people))
     subjects = [person for person in people if not person.bystander]
     if not subjects:
         raise InputError("a simulation needs a subject; everybody is a bystander")
@@ -266,7 +270,7 @@ def simulate(
         progress("cameras", len(rig), len(rig))
     return Simulation(
         name=name,
-        rig=rig,
+        rig=believed(of_rig, rig, rig_noise or RigNoise()),
         landmark_set=landmark_set,
         people=tuple(people),
         rate_hz=rate_hz,

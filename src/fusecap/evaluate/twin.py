@@ -29,6 +29,7 @@ from fusecap.body.skeleton import PAPER21
 from fusecap.errors import InputError, nearest
 from fusecap.evaluate.imu_noise import IMUS_6, IMUS_13, ImuNoise
 from fusecap.evaluate.keypoint_noise import KeypointNoise
+from fusecap.evaluate.rig_noise import RigNoise
 from fusecap.evaluate.simulator import Person, Simulation, camera_ring, placed, simulate
 
 TWIN_VERSION = "0 (provisional)"
@@ -51,6 +52,7 @@ VOLUME_M = (-2.2, 2.2, -2.2, 2.2)
 
 TWIN_KEYPOINT_NOISE = KeypointNoise()
 TWIN_IMU_NOISE = ImuNoise()
+TWIN_RIG_NOISE = RigNoise(rotation_deg=0.05, position_m=0.003, world_m=0.008)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -211,6 +213,7 @@ def _captured(
         seed=seed,
         keypoint_noise=TWIN_KEYPOINT_NOISE,
         imu_noise=TWIN_IMU_NOISE,
+        rig_noise=TWIN_RIG_NOISE,
         name=name,
         volume_m=volume_m,
     )

@@ -6,6 +6,8 @@ sequences, and the plot shows the root of the first.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -123,7 +125,7 @@ def _errors(results: Results, cells: list[TwinCell]) -> list[float]:
     ]
 
 
-def _root_z(result: dict[str, list[list[float]]] | None) -> list[np.ndarray] | None:
+def _root_z(result: dict[str, Any] | None) -> list[np.ndarray] | None:
     """Errors of the root's z: position [mm], velocity [mm/s], acceleration [m/s²]."""
     if result is None:
         return None
