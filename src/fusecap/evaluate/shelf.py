@@ -141,8 +141,13 @@ def frame_numbers(take: Take) -> Int[np.ndarray, " t"]:
 
 
 def score_shelf(take: Take, truth_path: Path | str) -> ShelfScore:
+    """`score_people` against a truth file."""
+    return score_people(take, load_truth(truth_path))
+
+
+def score_people(take: Take, known: ShelfTruth) -> ShelfScore:
     """Score `take` on every frame that has truth; people are matched one to one, frame by frame."""
-    truth = load_truth(truth_path).points_in_world_m
+    truth = known.points_in_world_m
     actors = [actor for actor in ACTORS if actor < len(truth)]
     truth = truth[actors]
     estimate = np.full((len(take.subject_names), *truth.shape[1:]), np.nan)
