@@ -15,11 +15,13 @@ import argparse
 import tarfile
 import tempfile
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment, nnls
+from scipy.stats import rankdata
 from shelf import write_shelf_session
 
 from fusecap.body.landmarks import LandmarkSet
@@ -112,7 +114,7 @@ def _recording(data: SessionData, *, frames: slice) -> Recording:
         flat = world.reshape(len(instants), people * count, 3)
         pixels = camera.project(flat.reshape(-1, 3)).reshape(size[1:] + (2,))
         width, height = camera.size_px
-        inside = (pixels >= 0).all(axis=-1) & (pixels < [width, height]).all(axis=-1)
+        inside = np.asarray((pixels >= 0).all(axis=-1) & (pixels < [width, height]).all(axis=-1))
         seen[index] = np.where(inside[..., None], pixels, np.nan) * scale
         hidden[index] = occluded(camera, np.nan_to_num(flat), together(capsules)).reshape(size[1:])
         depth = np.median(world @ camera.rotation[2] + camera.translation[2], axis=2)
@@ -201,7 +203,7 @@ def fitted(recording: Recording) -> dict[str, str]:
     table["  their distance by stature, quartiles"] = _quartiles(far[known & outlier], ".2f")
 
     in_view = np.isfinite(r.seen[..., 0])
-    detected = there.any(axis=-1, keepdims=True)
+    detected = np.asarray(there.any(axis=-1, keepdims=True))
     missed = ~np.isfinite(r.found[..., 0])
     due = in_view & detected
     table["missed, clear [%]"] = f"{100 * missed[due & clear].mean():.2f}"
@@ -213,7 +215,8 @@ def fitted(recording: Recording) -> dict[str, str]:
     for label, rows in (("most clear", open_ > 0.6), ("mostly hidden", open_ < 0.3)):
         gone = ~detected[..., 0]
         table[f"people missed, {label} [%]"] = f"{100 * gone[whole & rows].mean():.2f}"
-    table["  missed people's run [s]"] = f"{_run_s(~detected[..., 0] & whole, whole, r.rate_hz):.3f}"
+    run_s = _run_s(~detected[..., 0] & whole, whole, r.rate_hz)
+    table["  missed people's run [s]"] = f"{run_s:.3f}"
     table["nobody's detections per view and frame"] = f"{r.nobody.mean():.3f}"
     table |= _confidence(error, r.found[..., 2], r.hidden, outlier)
     return table | _confusion(r)
@@ -242,10 +245,10 @@ def _size_and_speed(
     change, size, speed = change[known], apparent_px[known], speed_px_s[known]
     rows, variance, weight = [], [], []
     size_edges = np.quantile(size, np.linspace(0, 1, 7))
-    for low, high in zip(size_edges[:-1], size_edges[1:], strict=True):
+    for low, high in pairwise(size_edges):
         here = (size >= low) & (size <= high)
         speed_edges = np.quantile(speed[here], np.linspace(0, 1, 7))
-        for slow, fast in zip(speed_edges[:-1], speed_edges[1:], strict=True):
+        for slow, fast in pairwise(speed_edges):
             cell = here & (speed >= slow) & (speed <= fast)
             if cell.sum() > 50:
                 rows.append([1.0, np.median(size[cell]) ** 2, np.mean(speed[cell] ** 2)])
@@ -305,8 +308,7 @@ def _confidence(
 
 
 def _rank_correlation(a: np.ndarray, b: np.ndarray) -> float:
-    ranks = [np.argsort(np.argsort(x)) for x in (a, b)]
-    return float(np.corrcoef(*ranks)[0, 1])
+    return float(np.corrcoef(rankdata(a), rankdata(b))[0, 1])
 
 
 def _confusion(r: Recording) -> dict[str, str]:
@@ -356,7 +358,7 @@ def _overlap(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Measures a 2D detector's faults")
     parser.add_argument("folder", type=Path)
     parser.add_argument("--recording", choices=("shelf", "pose2sim"))
     arguments = parser.parse_args()

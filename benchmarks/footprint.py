@@ -29,6 +29,8 @@ class Run(NamedTuple):
     """A finished process."""
 
     seconds: float
+    cpu_s: float
+    """User and system; what a busy machine changes least."""
     peak_mb: float
     output: str
 
@@ -50,7 +52,7 @@ def run(command: list[str], **environment: str) -> Run:
             sys.exit(f"{command} failed:\n{errors.read()}")
         # Kilobytes on Linux, bytes on macOS.
         unit = 1e-6 if sys.platform == "darwin" else 1024e-6
-        return Run(seconds, usage.ru_maxrss * unit, output.read())
+        return Run(seconds, usage.ru_utime + usage.ru_stime, usage.ru_maxrss * unit, output.read())
 
 
 def start_up(bytecode: str) -> None:
@@ -62,18 +64,20 @@ def start_up(bytecode: str) -> None:
         "`from fusecap import Estimator`": [sys.executable, "-c", "from fusecap import Estimator"],
         "`fusecap --help`": [*FUSECAP, "--help"],
     }
-    seconds: dict[str, list[float]] = {name: [] for name in commands}
+    runs: dict[str, list[Run]] = {name: [] for name in commands}
     for call in range(CALLS + 1):
         for name, command in commands.items():
-            taken = run(command, PYTHONPYCACHEPREFIX=bytecode).seconds
+            finished = run(command, PYTHONPYCACHEPREFIX=bytecode)
             if call:  # the first writes the bytecode
-                seconds[name].append(taken)
-    bare = statistics.median(seconds["`python -c pass`"])
-    print(f"| process (median of {CALLS}) | seconds | less interpreter start |")
-    print("|---|---|---|")
-    for name, values in seconds.items():
-        median = statistics.median(values)
-        print(f"| {name} | {median:.2f} | {median - bare:.2f} |")
+                runs[name].append(finished)
+    bare = statistics.median(r.seconds for r in runs["`python -c pass`"])
+    print(f"| process (median of {CALLS}) | seconds | less interpreter start | least | CPU |")
+    print("|---|---|---|---|---|")
+    for name, finished in runs.items():
+        median = statistics.median(r.seconds for r in finished)
+        least = min(r.seconds for r in finished)
+        cpu = statistics.median(r.cpu_s for r in finished)
+        print(f"| {name} | {median:.2f} | {median - bare:.2f} | {least:.2f} | {cpu:.2f} |")
 
 
 def compilation(bytecode: str) -> None:
@@ -88,9 +92,11 @@ def compilation(bytecode: str) -> None:
             )
             for _ in range(2)
         )
-    print("\n| all kernels | seconds | peak MB |\n|---|---|---|")
-    print(f"| compiled, cold cache | {first.seconds:.1f} | {first.peak_mb:.0f} |")
-    print(f"| from the cache | {second.seconds:.2f} | {second.peak_mb:.0f} |")
+    print("\n| all kernels | seconds | CPU | peak MB |\n|---|---|---|---|")
+    print(
+        f"| compiled, cold cache | {first.seconds:.1f} | {first.cpu_s:.1f} | {first.peak_mb:.0f} |"
+    )
+    print(f"| from the cache | {second.seconds:.2f} | {second.cpu_s:.2f} | {second.peak_mb:.0f} |")
 
 
 def solving(bytecode: str, times: int) -> None:
@@ -101,9 +107,7 @@ def solving(bytecode: str, times: int) -> None:
         with tempfile.TemporaryDirectory() as folder:
             session = Path(folder) / "session"
             run([sys.executable, __file__, "--write", str(session), "--times", str(repeats)])
-            done = run(
-                [*FUSECAP, "solve", str(session), "--json"], PYTHONPYCACHEPREFIX=bytecode
-            )
+            done = run([*FUSECAP, "solve", str(session), "--json"], PYTHONPYCACHEPREFIX=bytecode)
             report = json.loads(done.output)
         length = "the demo" if repeats == 1 else f"{repeats} times as long"
         print(

@@ -1,4 +1,4 @@
-"""The file that other solvers read (benchmarks/peers) holds the cost of eq. 2, number for number."""
+"""The file that other solvers read (benchmarks/peers) holds the cost of eq. 2 in full."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks" / "peers"))
 
+from pose_problem import build_problems, read_problems, write_problems
+from scipy_peer import ScipyProblem
+
 from fusecap.body.landmarks import LANDMARK_SETS
 from fusecap.body.prior import PosePrior
 from fusecap.body.shape import BodyShape
@@ -19,9 +22,7 @@ from fusecap.geometry.camera import Camera, Rig
 from fusecap.solve.options import SolverOptions, Weights
 from fusecap.solve.pose_solver import Measurements, PoseSolver
 from paper_twin import Twin
-from pose_problem import build_problems, read_problems, write_problems
 from scenes import IMU13, flat_prior, measure, random_pose, ring
-from scipy_peer import ScipyProblem
 
 OPTIONS = SolverOptions(weights=Weights.paper(), function_tolerance=1e-5, floor_radius_m=0.5)
 FLOOR_BONES = ("left_foot", "left_toes", "right_foot", "right_toes")

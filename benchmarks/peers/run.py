@@ -3,8 +3,9 @@
     OPENBLAS_NUM_THREADS=1 taskset -c 1 uv run python benchmarks/peers/run.py [--weights paper]
 
 Prints Markdown. Needs Ceres and CMake (Debian: apt-get install libceres-dev cmake). Every
-repetition lets each solver pass over all frames; a frame's time is the median over repetitions, in
-processor time, so that other work on the machine counts little and counts for all alike.
+repetition lets each solver pass over all frames, with fusecap again right before each peer. Times
+are processor time, a frame's time is the median over repetitions, and a ratio compares a pass with
+fusecap's beside it, so that other work on the machine counts little and counts for all alike.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import shutil
 import subprocess
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -56,6 +58,16 @@ class Row:
     name: str
     frames: np.ndarray
     passes: list[Pass]
+    beside: list[Pass]
+    """Fusecap's passes, each right before one of `passes`; over all frames."""
+
+    @property
+    def ratios(self) -> np.ndarray:
+        """Median time over fusecap's on the same frames, per repetition."""
+        pairs = zip(self.passes, self.beside, strict=True)
+        return np.array(
+            [np.median(p.seconds) / np.median(ours.seconds[self.frames]) for p, ours in pairs]
+        )
 
     @property
     def milliseconds(self) -> np.ndarray:
@@ -127,18 +139,17 @@ def scipy_pass(problems: Problems, frames: np.ndarray) -> Pass:
 
 
 def time_table(rows: list[Row]) -> str:
-    """Ratios compare medians over the frames that both solved."""
     lines = [
-        "| solver | median ms | p99 ms | linear solves, mean | time / fusecap |",
+        "| solver | median ms | p99 ms | linear solves, mean | time / fusecap (range) |",
         "|---|---|---|---|---|",
     ]
-    ours = rows[0].milliseconds
     for row in rows:
         ms = row.milliseconds
-        ratio = np.median(ms) / np.median(ours[row.frames])
+        ratios = row.ratios
         lines.append(
             f"| {row.name} | {np.median(ms):.3f} | {np.percentile(ms, 99):.3f} "
-            f"| {row.passes[0].iterations.mean():.2f} | {ratio:.1f} |"
+            f"| {row.passes[0].iterations.mean():.2f} "
+            f"| {np.median(ratios):.1f} ({ratios.min():.1f}-{ratios.max():.1f}) |"
         )
     return "\n".join(lines)
 
@@ -187,7 +198,7 @@ def main() -> None:
     program = build_ceres(arguments.folder / "build")
     version = subprocess.run(
         [program, "--version"], check=True, capture_output=True, text=True
-    ).stdout.strip()
+    ).stdout
     problems, solver, with_quality = record_problems(
         frames=arguments.frames, weights=arguments.weights
     )
@@ -197,31 +208,41 @@ def main() -> None:
 
     everything = np.arange(len(problems))
     few = np.linspace(0, len(problems) - 1, arguments.scipy_frames).astype(int)
-    rows = [Row(name="fusecap", frames=everything, passes=[])]
-    rows.append(Row(name="fusecap, with quality per bone", frames=everything, passes=[]))
-    rows += [Row(name=name, frames=everything, passes=[]) for name in CERES.values()]
-    started_as_ours = Row(name=f"{CERES['grouped']}, μ = {damping:g}", frames=everything, passes=[])
-    rows.append(started_as_ours)
-    rows.append(Row(name="SciPy least_squares", frames=few, passes=[]))
-    for _ in range(arguments.repetitions):
-        rows[0].passes.append(fusecap_pass(solver, problems))
-        rows[1].passes.append(fusecap_pass(with_quality, problems))
-        for row, variant in zip(rows[2:], CERES, strict=False):
-            row.passes.append(ceres_pass(program, problem_file, variant, CERES_DEFAULT_DAMPING))
-        started_as_ours.passes.append(ceres_pass(program, problem_file, "grouped", damping))
-    rows[-1].passes.append(scipy_pass(problems, few))
+    peers = {
+        "fusecap, with quality per bone": lambda: fusecap_pass(with_quality, problems),
+        **{
+            name: partial(ceres_pass, program, problem_file, variant, CERES_DEFAULT_DAMPING)
+            for variant, name in CERES.items()
+        },
+        f"{CERES['grouped']}, μ = {damping:g}": partial(
+            ceres_pass, program, problem_file, "grouped", damping
+        ),
+        "SciPy least_squares": lambda: scipy_pass(problems, few),
+    }
+    rows = {name: Row(name=name, frames=everything, passes=[], beside=[]) for name in peers}
+    rows["SciPy least_squares"] = Row(name="SciPy least_squares", frames=few, passes=[], beside=[])
+    ours = Row(name="fusecap", frames=everything, passes=[], beside=[])
+    for repetition in range(arguments.repetitions):
+        for name, solve in peers.items():
+            if name.startswith("SciPy") and repetition > 0:
+                continue  # too slow to repeat
+            rows[name].beside.append(fusecap_pass(solver, problems))
+            rows[name].passes.append(solve())
+            ours.passes.append(rows[name].beside[-1])
+            ours.beside.append(rows[name].beside[-1])
+    table = [ours, *rows.values()]
 
     keypoints = int(np.sum(problems.frames["keypoints"][..., 2] > 0) / len(problems))
     sizes = problems.sizes
     print(
         f"{len(problems)} frames, {sizes['cameras']} cameras, {sizes['landmarks']} keypoints "
         f"({keypoints} seen per frame), {sizes['imus']} IMUs, weights: {arguments.weights}; "
-        f"Ceres {version}, SciPy {scipy.__version__}, {arguments.repetitions} repetitions\n"
+        f"Ceres {version.strip()}, SciPy {scipy.__version__}, {arguments.repetitions} repetitions\n"
     )
-    print(time_table(rows))
+    print(time_table(table))
     print("\nRelative difference to fusecap's cost at equal poses, and where each solver ends:\n")
-    print(cost_table(rows, solver, problems))
-    stopped = min(row.passes[0].converged for row in rows)
+    print(cost_table(table, solver, problems))
+    stopped = min(row.passes[0].converged for row in table)
     print(f"\nSmallest share of frames that a solver ended by its tolerance: {100 * stopped:.1f} %")
 
 

@@ -53,7 +53,9 @@ def _load(name: str) -> ShippedMotion:
         coefficients = stored["coefficients"].astype(np.float64)
         interval_s = float(stored["interval_s"])
     channels = np.stack([evaluate_series(c, interval_s, time_s) for c in coefficients])
-    return ShippedMotion(names=names, takes=takes, rate_hz=rate_hz, theta=theta_of_channels(channels))
+    return ShippedMotion(
+        names=names, takes=takes, rate_hz=rate_hz, theta=theta_of_channels(channels)
+    )
 
 
 def evaluate_series(

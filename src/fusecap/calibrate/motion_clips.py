@@ -95,9 +95,7 @@ def _fit(clip: Clip, motion: Motion, duration_s: float) -> Float[np.ndarray, "k 
     theta = _placed(clip, retarget(motion, PAPER21)[: int(np.ceil(frame[-1])) + 1])
     channels = _interpolated(_bridged_channels(theta, motion.rate_hz), frame)
     channels[:, 1] -= _floor_height_m(theta_of_channels(channels[None])[0])
-    coefficients = (
-        np.asarray(dct(channels, axis=0))[: round(2 * _CUTOFF_HZ * interval_s)] / samples
-    )
+    coefficients = np.asarray(dct(channels, axis=0))[: round(2 * _CUTOFF_HZ * interval_s)] / samples
     coefficients[0] /= 2
 
     smooth = theta_of_channels(evaluate_series(coefficients, interval_s, time_s)[None])[0]

@@ -19,8 +19,10 @@ from fusecap.cli import (
     calibrate_prior,
     demo,
     doctor,
+    evaluate_datasets,
     evaluate_twin,
     export,
+    simulate,
     solve,
 )
 from fusecap.cli.common import err, print_json
@@ -59,9 +61,11 @@ app.command(epilog=demo.EXAMPLE)(demo.demo)
 app.command(epilog=solve.EXAMPLE)(solve.solve)
 app.command(epilog=export.EXAMPLE)(export.export)
 app.command(epilog=doctor.EXAMPLE)(doctor.doctor)
+app.command(epilog=simulate.EXAMPLE)(simulate.simulate)
 calibrate.command(epilog=calibrate_offsets.EXAMPLE)(calibrate_offsets.offsets)
 calibrate.command(epilog=calibrate_prior.EXAMPLE)(calibrate_prior.prior)
 evaluate_twin.add_to(evaluate)
+evaluate_datasets.add_to(evaluate)
 
 
 def main() -> None:

@@ -6,10 +6,10 @@ force. The flesh under it yields: it falls behind when the bone turns, and tilts
 accelerated across its length. The calibration believes a mounting that is off by a constant as
 well, so eq. 8 and 12 give the bone's rotation and acceleration with all of these errors in them.
 
-The sensor is an InvenSense MPU-9250 (data sheet PS-MPU-9250A-01, rev. 1.0): 8 mg rms of noise on the
-accelerometer and 0.1 deg/s rms on the gyroscope behind 92 Hz filters. The orientation is as good as
-fusion on the sensor is said to be: 2 deg rms in motion (Xsens, MTi and MTx user manual, rev. N,
-sec. 4.2).
+The sensor is an InvenSense MPU-9250 (data sheet PS-MPU-9250A-01, rev. 1.0): 8 mg rms of noise on
+the accelerometer and 0.1 deg/s rms on the gyroscope behind filters of 94 and 92 Hz. Its orientation
+is as good as fusion is said to make it: 2 deg rms in motion (Xsens, MTi and MTx user manual,
+MT0100P rev. N, sec. 4.2).
 """
 
 from __future__ import annotations
@@ -152,7 +152,7 @@ class SimulatedImus:
         return np.roll(rotation.as_quat(canonical=True), 1, axis=1)
 
     def readings(self) -> tuple[ImuReading, ...]:
-        """What the solver is given, per frame [1, eq. 8, 12], as a session's files would give it."""
+        """What the solver is given, per frame, as from a session's files [1, eq. 8, 12]."""
         mounted = []
         for sensor, bone in enumerate(self.bones):
             kept = self.received[:, sensor]

@@ -356,7 +356,8 @@ def _confused(
                     rows = _belonging(landmark_set, parts)
                     rows &= [name.startswith(side) for name in landmark_set.landmark_names]
                     when = at_times((), noise.confusion_share, noise.confusion_s) & covered
-                    result[np.ix_(when, [a], rows)] = pixels[np.ix_(when, [b], rows)]
+                    taken = (when[:, None] & rows)[..., None]
+                    result[:, a] = np.where(taken, pixels[:, b], result[:, a])
     return result
 
 

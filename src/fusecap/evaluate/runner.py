@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import multiprocessing
 import os
 import signal
@@ -37,9 +38,12 @@ Work = Callable[[Any], dict[str, Any]]
 Progress = Callable[["Outcome", int, int], None]
 """Called as each cell ends, with (what became of it, cells done, cells in all)."""
 
-_ONE_THREAD = dict.fromkeys(
-    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
-)
+_ONE_THREAD: dict[str, str] = {
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "NUMBA_NUM_THREADS": "1",
+}
 _NOT_IN_RESULTS = (
     "__main__.py",
     "cli.py",
@@ -261,6 +265,7 @@ def _on_ray(
     """One Ray task on one core per cell; nodes need this version of fusecap installed."""
     try:
         import ray
+        from ray.exceptions import RayError
     except ImportError:
         raise InputError("--ray needs Ray; install fusecap[cluster]") from None
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
@@ -269,12 +274,13 @@ def _on_ray(
         ray.init(
             address=address,
             log_to_driver=False,
-            logging_level="error",
+            logging_level=logging.ERROR,
             runtime_env={"env_vars": _ONE_THREAD},
             **local,
         )
-    except (ConnectionError, ValueError) as error:
-        raise InputError(f"no Ray cluster at '{address}': {error}") from error
+    except Exception as error:
+        # Ray raises ConnectionError, ValueError, or Exception itself.
+        raise InputError(f"Ray did not start at '{address}': {error}") from error
     try:
         # A task whose worker dies is not repeated: its cell fails, as on our own cores.
         task = ray.remote(num_cpus=1, max_retries=0)(_same_code)
@@ -283,10 +289,11 @@ def _on_ray(
         while flying:
             for reference in ray.wait(list(flying))[0]:
                 try:
-                    ended = ray.get(reference)
-                except ray.exceptions.RayError as error:
-                    ended = None, f"{type(error).__name__}: {str(error).splitlines()[0]}", 0.0
-                yield flying.pop(reference), *ended
+                    result, error, elapsed_s = ray.get(reference)
+                except RayError as lost:
+                    result, elapsed_s = None, 0.0
+                    error = f"{type(lost).__name__}: {str(lost).splitlines()[0]}"
+                yield flying.pop(reference), result, error, elapsed_s
     finally:
         ray.shutdown()
 

@@ -2,7 +2,8 @@
 
 session.toml   calibration.toml   truth.npz
 keypoints/<camera>/<camera>_<frame>_keypoints.json        OpenPose
-imus/<subject>_<bone>.csv        time_s, qw, qx, qy, qz (imu_world_from_imu, y up), ax, ay, az
+imus/<subject>_<bone>.csv        time_s, qw, qx, qy, qz (imu_world_from_imu, y up), ax, ay, az,
+                                 gx, gy, gz; lost samples have no row
 """
 
 from __future__ import annotations
@@ -14,31 +15,43 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from fusecap.body.shape import BodyShape
 from fusecap.errors import InputError
 from fusecap.evaluate.imu_noise import SimulatedImus
-from fusecap.evaluate.simulator import Person, Simulation
+from fusecap.evaluate.simulator import Person, Progress, Simulation
 from fusecap.geometry.camera import Rig
 from fusecap.sinks.files import safe_name, written_whole
 from fusecap.sinks.take import save_take
 
 
-def write_session(simulation: Simulation, folder: Path | str) -> Path:
-    """Write everything; returns the path of `session.toml`, which is written last."""
+def write_session(
+    simulation: Simulation,
+    folder: Path | str,
+    *,
+    bone_lengths: bool = True,
+    progress: Progress | None = None,
+) -> Path:
+    """Write everything; returns the path of `session.toml`, which is written last.
+
+    Bone lengths are written where they deviate from the stature's, unless told not to.
+    """
     folder = Path(folder)
     _write(folder / "calibration.toml", calibration_toml(simulation.rig))
-    for camera, name in enumerate(simulation.rig.names):
-        for frame, detections in enumerate(simulation.detections):
+    for name, view in zip(simulation.rig.names, simulation.views, strict=True):
+        for frame, people in enumerate(view.people):
             _write(
                 folder / "keypoints" / name / f"{name}_{frame:012d}_keypoints.json",
-                _openpose_json(detections.people[camera]),
+                _openpose_json(people),
             )
+            if progress:
+                progress(f"writing '{name}'", frame + 1, len(view.people))
     for subject, imus in simulation.imus.items():
         for sensor, bone in enumerate(imus.bones):
-            _write(folder / _imu_file(subject, bone), _imu_csv(simulation, imus, sensor))
+            _write(folder / _imu_file(subject, bone), _imu_csv(imus, sensor))
     save_take(simulation.truth, folder / "truth.npz")
     path = folder / "session.toml"
     with written_whole(path) as file:
-        file.write(_session_toml(simulation).encode())
+        file.write(_session_toml(simulation, bone_lengths).encode())
     return path
 
 
@@ -59,14 +72,14 @@ def calibration_toml(rig: Rig) -> str:
     return "\n".join(tables)
 
 
-def _session_toml(simulation: Simulation) -> str:
+def _session_toml(simulation: Simulation, bone_lengths: bool) -> str:
     fmt = f"openpose-{simulation.landmark_set.name}"
     head = [
         f"# Simulated; seed {simulation.seed}. The truth is in truth.npz.",
         "[session]",
         f"name = {_text(simulation.name)}",
         f"rate_hz = {simulation.rate_hz!r}",
-        'calibration = "calibration.toml"',
+        *(['calibration = "calibration.toml"'] if len(simulation.rig) else []),
         'up = "y"',
         "floor = true",
         f"max_subjects = {len(simulation.subjects)}",
@@ -79,24 +92,31 @@ def _session_toml(simulation: Simulation) -> str:
         f"name = {_text(name)}\n"
         f"keypoints = {_text(f'keypoints/{name}')}\n"
         f'format = "{fmt}"\n'
-        f"rate_hz = {simulation.rate_hz!r}\n"
-        "offset_s = 0.0\n"
-        for name in simulation.rig.names
+        f"rate_hz = {view.timing.rate_hz!r}\n"
+        f"offset_s = {view.timing.offset_s!r}\n"
+        for name, view in zip(simulation.rig.names, simulation.views, strict=True)
     ]
     for person in simulation.subjects:
-        tables.append(_subject_toml(person))
+        tables.append(_subject_toml(person, bone_lengths))
         if person.name in simulation.imus:
             tables += _imu_toml(person.name, simulation.imus[person.name])
     return "\n".join(tables)
 
 
-def _subject_toml(person: Person) -> str:
-    start = np.round(person.theta[0, [0, 2]], 2).tolist()
+def _subject_toml(person: Person, bone_lengths: bool) -> str:
+    shape = person.shape
+    proportions = BodyShape.from_height(shape.skeleton, shape.height_m).offsets_m
+    lengths = [
+        f"{name} = {float(np.linalg.norm(shape.offsets_m[bone]))!r}"
+        for bone, name in enumerate(shape.skeleton.bone_names)
+        if bone_lengths and not np.allclose(shape.offsets_m[bone], proportions[bone], atol=1e-9)
+    ]
     return (
         "[[subject]]\n"
         f"name = {_text(person.name)}\n"
-        f"height_m = {person.shape.height_m!r}\n"
-        f"start_m = {start}\n"
+        f"height_m = {shape.height_m!r}\n"
+        f"start_m = {np.round(person.theta[0, [0, 2]], 2).tolist()}\n"
+        + (f"bone_lengths_m = {{ {', '.join(lengths)} }}\n" if lengths else "")
     )
 
 
@@ -118,11 +138,15 @@ def _imu_file(subject: str, bone: str) -> str:
     return f"imus/{safe_name(subject)}_{bone}.csv"
 
 
-def _imu_csv(simulation: Simulation, imus: SimulatedImus, sensor: int) -> str:
-    time_s = simulation.truth.timestamps_ns * 1e-9
-    quaternion = _wxyz(imus.world_from_imu[:, sensor])
-    rows = np.column_stack([time_s, quaternion, imus.accel_m_s2[:, sensor]])
-    lines = ["time_s,qw,qx,qy,qz,ax,ay,az"]
+def _imu_csv(imus: SimulatedImus, sensor: int) -> str:
+    columns = [
+        imus.times_s,
+        imus.orientation_wxyz(sensor),
+        imus.accel_m_s2[:, sensor],
+        imus.gyro_rad_s[:, sensor],
+    ]
+    rows = np.column_stack(columns)[imus.received[:, sensor]]
+    lines = ["time_s,qw,qx,qy,qz,ax,ay,az,gx,gy,gz"]
     lines += [",".join(f"{value:.9f}" for value in row) for row in rows]
     return "\n".join(lines) + "\n"
 

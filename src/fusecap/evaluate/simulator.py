@@ -348,12 +348,13 @@ def camera_ring(
     target_height_m: float = 0.9,
     size_px: tuple[int, int] = (1920, 1080),
     focal_px: float = 1150.0,
+    span_deg: float = 360.0,
 ) -> Rig:
     """Cameras evenly spaced on a circle, all looking at its axis; the first stands at 45 degrees.
 
-    At 45 degrees from +z towards +x, so that four stand in the corners of a room.
+    At 45 degrees from +z towards +x, so that four stand in the corners of a room. A span below 360
+    makes it an arc about +z.
     """
-    cameras = []
     matrix = np.array(
         [
             [focal_px, 0.0, (size_px[0] - 1) / 2],
@@ -361,8 +362,12 @@ def camera_ring(
             [0.0, 0.0, 1.0],
         ]
     )
-    for index in range(count):
-        angle = np.pi / 4 + 2 * np.pi * index / count
+    angles = np.pi / 4 + 2 * np.pi * np.arange(count) / max(count, 1)
+    if span_deg < 360.0:
+        half = np.radians(span_deg) / 2
+        angles = np.linspace(half, -half, count) if count > 1 else np.zeros(count)
+    cameras = []
+    for index, angle in enumerate(angles):
         centre = np.array([radius_m * np.sin(angle), height_m, radius_m * np.cos(angle)])
         forward = np.array([0.0, target_height_m, 0.0]) - centre
         forward /= np.linalg.norm(forward)

@@ -69,7 +69,7 @@ def solve_factored(lower, right, solution_out):
 
 @kernel("void(f8[:, ::1], f8[:, ::1], f8[::1])")
 def inverse_diagonal(lower, inverse_scratch, diagonal_out):
-    """Diagonal of (Lᵀ L)⁻¹: the squared rows of L⁻¹, each found from those above, four at a time."""
+    """Diagonal of (Lᵀ L)⁻¹: the squared rows of L⁻¹, each from those above, four at a time."""
     size = lower.shape[0]
     for i in range(size):
         for j in range(size):

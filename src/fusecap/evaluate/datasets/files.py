@@ -32,7 +32,9 @@ def camera_at_centre(
         path,
         name=name,
         size_px=np.array(size_px),
-        matrix=np.array([[focal_px[0], 0, centre_px[0]], [0, focal_px[1], centre_px[1]], [0, 0, 1]]),
+        matrix=np.array(
+            [[focal_px[0], 0, centre_px[0]], [0, focal_px[1], centre_px[1]], [0, 0, 1]]
+        ),
         distortion=np.array([*radial[:2], *tangential, radial[2]]),
         rotation=rotation,
         translation=-rotation @ position_m,

@@ -24,16 +24,12 @@ from fusecap.sources.calibration_files import load_rig
 from fusecap.sources.calibration_files.loader import Y_UP_FROM
 
 RATE_HZ = 29.97
-COCO19 = LandmarkSet(
-    name="coco19",
-    landmark_names=tuple(
-        (
-            "neck nose mid_hip left_shoulder left_elbow left_wrist left_hip left_knee left_ankle "
-            "right_shoulder right_elbow right_wrist right_hip right_knee right_ankle "
-            "left_eye left_ear right_eye right_ear"
-        ).split()
-    ),
+_NAMES = (
+    "neck nose mid_hip left_shoulder left_elbow left_wrist left_hip left_knee left_ankle "
+    "right_shoulder right_elbow right_wrist right_hip right_knee right_ankle "
+    "left_eye left_ear right_eye right_ear"
 )
+COCO19 = LandmarkSet(name="coco19", landmark_names=tuple(_NAMES.split()))
 """In the order of `joints19`."""
 _POSES = "hdPose3d_stage1_coco19"
 
@@ -79,7 +75,9 @@ def read_poses(folder: Path) -> LandmarkTruth:
         if (match := re.search(r"_(\d+)\.json$", path.name))
     }
     if not files:
-        raise InputError(f"{folder / _POSES}: no body3DScene_<frame>.json; expected the truth there")
+        raise InputError(
+            f"{folder / _POSES}: no body3DScene_<frame>.json; expected the truth there"
+        )
     people: dict[int, dict[int, np.ndarray]] = {}
     for frame, path in files.items():
         for who, joints in _bodies(path):

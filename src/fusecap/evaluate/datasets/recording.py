@@ -31,11 +31,18 @@ from fusecap.types import Detections, ImuReading
 class Truth(Protocol):
     """What a data set knows of G people over T frames, at J named places; NaN where unknown."""
 
-    names: tuple[str, ...]
-    """Of the J places, the root first."""
-    points_in_world_m: Float[np.ndarray, "g t j 3"]
-    rotation_in_world: Float[np.ndarray, "g t j 3 3"] | None
-    """Of bones."""
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the J places."""
+        ...
+
+    @property
+    def points_in_world_m(self) -> Float[np.ndarray, "g t j 3"]: ...
+
+    @property
+    def rotation_in_world(self) -> Float[np.ndarray, "g t j 3 3"] | None:
+        """Of bones."""
+        ...
 
     def points_of(self, take: Take) -> Float[np.ndarray, "s t j 3"]:
         """The same places on the people of a take [m]."""

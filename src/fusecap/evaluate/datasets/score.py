@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from fusecap.evaluate.metrics import (
     root_relative_error_m,
     summarize,
 )
-from fusecap.evaluate.tables import Table
+from fusecap.evaluate.tables import Table, Value
 from fusecap.sinks.files import written_whole
 from fusecap.sinks.take import Take
 
@@ -31,7 +32,7 @@ class TruthScore:
 
     position_error_mm: Summary
     root_relative_error_mm: Summary
-    """Relative to the first place."""
+    """Relative to the hips or mid-hip; else to the first place."""
     aligned_error_mm: Summary
     """After Procrustes; of frames in which every place is known."""
     orientation_error_deg: Summary
@@ -66,6 +67,8 @@ def score_truth(take: Take, truth: Truth, rate_hz: float, *, gate_m: float = 0.5
     found = match[person, frame]
     x, y = points[found, frame], true[person, frame]
     error_mm = position_error_m(x, y) * 1e3
+    root = next((truth.names.index(r) for r in _ROOTS if r in truth.names), 0)
+    from_root = [root, *(row for row in range(len(truth.names)) if row != root)]
     orientation_deg = np.zeros(0)
     rotations = truth.rotations_of(take)
     if rotations is not None and truth.rotation_in_world is not None:
@@ -76,7 +79,9 @@ def score_truth(take: Take, truth: Truth, rate_hz: float, *, gate_m: float = 0.5
         )
     return TruthScore(
         position_error_mm=summarize(error_mm),
-        root_relative_error_mm=summarize(root_relative_error_m(x, y) * 1e3),
+        root_relative_error_mm=summarize(
+            root_relative_error_m(x[:, from_root], y[:, from_root]) * 1e3
+        ),
         aligned_error_mm=summarize(aligned_error_m(x, y) * 1e3),
         orientation_error_deg=summarize(orientation_deg),
         point_error_mm={
@@ -86,6 +91,8 @@ def score_truth(take: Take, truth: Truth, rate_hz: float, *, gate_m: float = 0.5
         identity_switches=identity_switches(match),
     )
 
+
+_ROOTS = ("hips", "mid_hip")
 
 COLUMNS = (
     "sequence",
@@ -104,14 +111,33 @@ COLUMNS = (
 
 def score_table(title: str, scores: Sequence[tuple[str, TruthScore]], *, note: str = "") -> Table:
     """A row per sequence, and their mean."""
-    rows = [(name, *_row(score)) for name, score in scores]
-    if len(rows) > 1:
-        values = np.array([row[1:] for row in rows], dtype=np.float64)
-        counted = np.isfinite(values).sum(axis=0)
-        total = np.where(np.isfinite(values), values, 0.0).sum(axis=0)
-        mean = np.where(counted > 0, total / np.maximum(counted, 1), np.nan)
-        rows.append(("mean", *(float(value) for value in mean)))
-    return Table(title=title, columns=COLUMNS, rows=tuple(rows), note=note)
+    rows = tuple((name, *_row(score)) for name, score in scores)
+    return _with_mean(Table(title=title, columns=COLUMNS, rows=rows, note=note))
+
+
+def mean_by_name(table: Table) -> Table:
+    """The means of the rows that share a name, and the mean of those."""
+    rows: dict[str, list[tuple[Value, ...]]] = {}
+    for row in table.rows[: -1 if len(table.rows) > 1 else None]:
+        rows.setdefault(str(row[0]), []).append(row[1:])
+    means = tuple((name, *_mean(some)) for name, some in rows.items())
+    return _with_mean(replace(table, rows=means))
+
+
+def _with_mean(table: Table) -> Table:
+    if len(table.rows) < 2:
+        return table
+    mean = ("mean", *_mean([row[1:] for row in table.rows]))
+    return replace(table, rows=(*table.rows, mean))
+
+
+def _mean(rows: Sequence[tuple[Value, ...]]) -> tuple[float, ...]:
+    """Per column, over the rows that have a value."""
+    values = np.array(rows, dtype=np.float64)
+    known = np.isfinite(values)
+    total = np.where(known, values, 0.0).sum(axis=0)
+    count = known.sum(axis=0)
+    return tuple(np.where(count > 0, total / np.maximum(count, 1), np.nan).tolist())
 
 
 def _row(score: TruthScore) -> tuple[float | int, ...]:
@@ -132,8 +158,6 @@ def _row(score: TruthScore) -> tuple[float | int, ...]:
 
 def write_table(table: Table, out: Path, name: str) -> list[Path]:
     """Markdown, CSV and JSON; returns their paths."""
-    import json
-
     texts = {
         ".md": table.markdown(),
         ".csv": table.csv(),

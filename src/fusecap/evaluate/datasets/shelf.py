@@ -24,7 +24,8 @@ from fusecap.body.landmarks import landmark_set_named
 from fusecap.errors import InputError
 from fusecap.evaluate.datasets.files import camera_at_centre, unpacked
 from fusecap.evaluate.datasets.recording import Recording, last_frame, read_views
-from fusecap.evaluate.shelf import MID_HIP, RATE_HZ, ShelfTruth, load_truth
+from fusecap.evaluate.shelf import MID_HIP, RATE_HZ, ShelfScore, ShelfTruth, load_truth
+from fusecap.evaluate.tables import Table
 from fusecap.geometry.camera import Y_UP_FROM_Z_UP, Rig
 from fusecap.sources.calibration_files import fields, load_rig
 from fusecap.sources.calibration_files.json_file import load
@@ -139,6 +140,20 @@ def read_actors(path: Path) -> ShelfTruth:
                 )
     points[:, :, MID_HIP] = (points[:, :, 2] + points[:, :, 3]) / 2
     return ShelfTruth(points_in_world_m=points)
+
+
+def pcp_table(name: str, score: ShelfScore) -> Table:
+    """3D PCP per actor and per kind of limb."""
+    rows = [(f"actor {actor}", pcp) for actor, pcp in score.actor_pcp.items()]
+    rows += [*score.limb_pcp.items(), ("mean over actors", score.pcp)]
+    return Table(
+        title=f"{name.capitalize()}: 3D PCP",
+        columns=("of", "PCP %"),
+        rows=tuple(rows),
+        digits=2,
+        note=f"{score.person_frames} person-frames, {score.missed_person_frames} of them missed, "
+        f"{score.identity_switches} identity switches",
+    )
 
 
 def _unwrapped(value: Any) -> np.ndarray:

@@ -88,7 +88,7 @@ class Results:
 
     def mean(self, cells: Iterable[TwinCell], *path: str) -> float:
         """Mean of one number over the cells that have it, e.g. "score", "idf1"."""
-        return _mean([number(self.of(cell), *path) for cell in cells])
+        return mean([number(self.of(cell), *path) for cell in cells])
 
     def spread(self, cells: Iterable[TwinCell], *path: str) -> Spread:
         """A `Summary` pooled over cells of equal length, e.g. "score", "position_error_mm"."""
@@ -96,14 +96,14 @@ class Results:
             [number(self.of(cell), *path, part) for part in ("mean", "std", "median", "mad")]
             for cell in cells
         ]
-        mean, std, median, mad = (np.array(column) for column in zip(*each, strict=True))
-        pooled = _mean(mean)
+        means, std, median, mad = (np.array(column) for column in zip(*each, strict=True))
+        pooled = mean(means)
         return Spread(
             mean=pooled,
-            std=math.sqrt(max(_mean(std**2 + mean**2) - pooled**2, 0.0)),
-            median=_mean(median),
-            mad=_mean(mad),
-            across=float(np.nanstd(mean)) if np.isfinite(mean).any() else math.nan,
+            std=math.sqrt(max(mean(std**2 + means**2) - pooled**2, 0.0)),
+            median=mean(median),
+            mad=mean(mad),
+            across=float(np.nanstd(means)) if np.isfinite(means).any() else math.nan,
         )
 
 
@@ -128,7 +128,13 @@ def number(result: Any, *path: str) -> float:
     return float(result) if isinstance(result, int | float) else math.nan
 
 
-def _mean(values: Sequence[float] | np.ndarray) -> float:
+def with_spread(value: float, spread: float) -> str | None:
+    """Such as "26.1 (9.3)"; None where it is unknown."""
+    return f"{value:.1f} ({spread:.1f})" if math.isfinite(value + spread) else None
+
+
+def mean(values: Sequence[float] | np.ndarray) -> float:
+    """Over the values that are numbers; NaN where none is."""
     known = np.array(values, dtype=np.float64)
     known = known[np.isfinite(known)]
     return float(known.mean()) if len(known) else math.nan

@@ -14,6 +14,7 @@ from fusecap.evaluate.experiments.experiment import (
     Spread,
     below,
     both,
+    with_spread,
 )
 from fusecap.evaluate.tables import Table
 
@@ -72,7 +73,7 @@ def _table(settings: Settings, errors: Errors, metric: str) -> Table:
             (
                 count,
                 *[_shown(errors.get((count, imus, metric))) for imus in IMUS],
-                f"{errors[count, 13, metric].median:.1f} ({errors[count, 13, metric].mad:.1f})",
+                with_spread(errors[count, 13, metric].median, errors[count, 13, metric].mad),
             )
             for count in cameras(settings)
         ),
@@ -83,7 +84,7 @@ def _table(settings: Settings, errors: Errors, metric: str) -> Table:
 
 
 def _shown(spread: Spread | None) -> str | None:
-    return f"{spread.mean:.1f} ({spread.std:.1f})" if spread else None
+    return with_spread(spread.mean, spread.std) if spread else None
 
 
 def _findings(errors: Errors) -> tuple[Finding, ...]:

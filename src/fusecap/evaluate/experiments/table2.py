@@ -11,6 +11,7 @@ from fusecap.evaluate.experiments.experiment import (
     Settings,
     below,
     both,
+    with_spread,
 )
 from fusecap.evaluate.tables import Table
 
@@ -43,8 +44,8 @@ def report(settings: Settings, results: Results) -> Report:
         rows.append(
             (
                 name,
-                f"{place.mean:.1f} ({place.std:.1f})",
-                f"{turn.mean:.1f} ({turn.std:.1f})",
+                with_spread(place.mean, place.std),
+                with_spread(turn.mean, turn.std),
                 paper_mm,
                 paper_deg,
                 OTHERS[name],

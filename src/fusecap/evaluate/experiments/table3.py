@@ -6,6 +6,7 @@ prior are also taken with sparse input, where it has most to do.
 
 from __future__ import annotations
 
+import math
 from functools import cache
 from typing import Any
 
@@ -99,7 +100,11 @@ def report(settings: Settings, results: Results) -> Report:
 
 
 def _shown(name: str, spread: dict[str, Spread], full: dict[str, Spread]) -> tuple[Value, ...]:
-    return (name, *[f"{spread[m].mean:.1f} ({spread[m].mean / full[m].mean:.2f})" for m in METRICS])
+    return (name, *[_relative(spread[m].mean, full[m].mean) for m in METRICS])
+
+
+def _relative(value: float, full: float) -> str | None:
+    return f"{value:.1f} ({value / full:.2f})" if math.isfinite(value + full) else None
 
 
 def _sparse(settings: Settings, results: Results) -> tuple[Table, Finding]:
