@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fusecap.associate.tracker import Tracker
 from fusecap.body.landmarks import landmark_set_named
 from fusecap.body.motion_model import load_demo_motion
 from fusecap.body.prior import PosePrior, load_prior
@@ -153,8 +152,3 @@ def on_skeleton(theta: np.ndarray, skeleton: Skeleton) -> np.ndarray:
             source = 3 + 3 * PAPER21.bone(name)
             moved[:, 3 + 3 * bone : 6 + 3 * bone] = theta[:, source : source + 3]
     return moved
-
-
-def tracker(built: Scene) -> Tracker:
-    """The default sorter of the scene's cameras."""
-    return Tracker(built.simulation.rig, built.simulation.landmark_set)

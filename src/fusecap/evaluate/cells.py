@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Literal, cast, get_args
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -16,7 +16,7 @@ from fusecap.evaluate.score import score_take
 from fusecap.evaluate.simulated_solve import solve_simulation
 from fusecap.evaluate.simulator import Simulation
 from fusecap.evaluate.twin import (
-    GroupName,
+    GROUPS,
     told_by_height,
     twin_group_simulation,
     twin_sequence,
@@ -90,9 +90,9 @@ def solve_cell(cell: TwinCell) -> dict[str, Any]:
 
 def simulation_of(cell: TwinCell) -> Simulation:
     """The capture that a cell solves."""
-    if cell.scene in get_args(GroupName):
+    if cell.scene in GROUPS:
         simulation = twin_group_simulation(
-            cast(GroupName, cell.scene), cameras=cell.cameras, imus=cell.imus, seed=cell.seed
+            cell.scene, cameras=cell.cameras, imus=cell.imus, seed=cell.seed
         )
     else:
         simulation = twin_simulation(

@@ -65,7 +65,7 @@ class SolverOptions:
     weights: Weights = field(default_factory=Weights)
     max_iterations: int = 30
     function_tolerance: float = 1e-4
-    """Stop when a step lowers the cost by less than this share of it."""
+    """Stop when a step lowers the cost, or promises to, by less than this share of it."""
     initial_damping: float = 1e-2
     floor_radius_m: float = 0.05
     """Distance kept between the floor and the ankle and toe joints [1, eq. 16]."""

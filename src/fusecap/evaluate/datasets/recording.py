@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float
@@ -28,37 +27,13 @@ from fusecap.sources.keypoint_files import read_keypoints
 from fusecap.types import Detections, ImuReading
 
 
-class Truth(Protocol):
-    """What a data set knows of G people over T frames, at J named places; NaN where unknown."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Of the J places."""
-        ...
-
-    @property
-    def points_in_world_m(self) -> Float[np.ndarray, "g t j 3"]: ...
-
-    @property
-    def rotation_in_world(self) -> Float[np.ndarray, "g t j 3 3"] | None:
-        """Of bones."""
-        ...
-
-    def points_of(self, take: Take) -> Float[np.ndarray, "s t j 3"]:
-        """The same places on the people of a take [m]."""
-        ...
-
-    def rotations_of(self, take: Take) -> Float[np.ndarray, "s t j 3 3"] | None:
-        """The orientations of the same bones."""
-        ...
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LandmarkTruth:
-    """Points that lie where our landmarks of the same names do."""
+    """Points of G people over T frames that lie where our landmarks of the same names do."""
 
     landmarks: LandmarkSet
     points_in_world_m: Float[np.ndarray, "g t j 3"]
+    """NaN where unknown."""
     rotation_in_world: None = None
 
     @property
@@ -87,10 +62,11 @@ class LandmarkTruth:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BoneTruth:
-    """Joint positions and bone rotations, under the names and in the axes of our bones."""
+    """Joints and rotations of G people over T frames, under the names and axes of our bones."""
 
     names: tuple[str, ...]
     points_in_world_m: Float[np.ndarray, "g t j 3"]
+    """NaN where unknown."""
     rotation_in_world: Float[np.ndarray, "g t j 3 3"]
 
     def on(self, skeleton: Skeleton) -> BoneTruth:
@@ -116,6 +92,9 @@ class BoneTruth:
 
     def _rows(self, take: Take) -> list[int]:
         return [take.skeleton.bone(name) for name in self.names]
+
+
+Truth = LandmarkTruth | BoneTruth
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

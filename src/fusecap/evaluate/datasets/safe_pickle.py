@@ -17,7 +17,7 @@ import pickle
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
@@ -62,7 +62,7 @@ class _Refused(Exception):
     pass
 
 
-def _load(file: BinaryIO, where: str) -> Any:
+def _load(file: io.BufferedIOBase, where: str) -> Any:
     try:
         return _ArraysOnly(file, encoding="latin1").load()
     except _Refused as error:

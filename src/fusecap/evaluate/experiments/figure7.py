@@ -173,14 +173,18 @@ def _plot(settings: Settings, errors: Errors) -> Figure:
                 label=f"{imus} IMUs, mean",
             )
             ax.errorbar(
-                counts,
+                # Side by side, to be told apart.
+                [count + 0.1 * (colour - 1) for count in counts],
                 [s.median for s in spreads],
                 [s.mad for s in spreads],
                 color=f"C{colour}",
                 capsize=3,
                 label=f"{imus} IMUs, median and MAD",
             )
-        ax.set_yscale("log")
+        if metric.endswith("_mm"):
+            ax.set_yscale("log")
+        else:
+            ax.set_ylim(bottom=0.0)
         ax.set_xlabel("cameras")
         ax.set_title(title)
         ax.grid(alpha=0.3, which="both")

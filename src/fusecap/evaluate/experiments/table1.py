@@ -21,6 +21,7 @@ from fusecap.evaluate.experiments.experiment import (
     with_spread,
 )
 from fusecap.evaluate.tables import Table, Value
+from fusecap.evaluate.twin import COMPARABLE_BONES
 
 PAPER_GLOBAL_MM = {
     "S1 FS3": 36.1,
@@ -41,9 +42,6 @@ PAPER_MEAN = {
     "aligned_orientation_error_deg": (7.4, 2.1),
 }
 """Mean over sequences and standard deviation across them."""
-
-UNSEEN = ("_hand", "_toes")
-"""Bones whose orientation little or nothing measures."""
 
 METRICS = {
     "position_error_mm": "position, global mm",
@@ -69,7 +67,7 @@ def report(settings: Settings, results: Results) -> Report:
     turned = results.spread(_row_cells(settings, "paper"), "score", "orientation_error_deg")
     default = results.spread(_row_cells(settings, "default"), "score", "position_error_mm")
     bones = _bones(_row_cells(settings, "paper"), results)
-    inner = [turn for bone, (_, turn, _) in bones.items() if not bone.endswith(UNSEEN)]
+    inner = [turn for bone, (_, turn, _) in bones.items() if bone in COMPARABLE_BONES]
     near = both(below(abs(paper.mean - 26.1), 26.1, 0.15), below(abs(turned.mean - 7.5), 7.5, 0.15))
     return Report(
         tables=(*tables, _per_bone(settings, results), _motion(settings, results)),
@@ -121,7 +119,7 @@ def _table(settings: Settings, results: Results, weights: str) -> Table:
 
 def _per_bone(settings: Settings, results: Results) -> Table:
     errors = _bones(_row_cells(settings, settings.weights), results)
-    inner = [values for bone, values in errors.items() if not bone.endswith(UNSEEN)]
+    inner = [values for bone, values in errors.items() if bone in COMPARABLE_BONES]
     rows: list[tuple[Value, ...]] = [(bone, *values) for bone, values in errors.items()]
     means = {"mean": list(errors.values()), "without hands and toes": inner} if errors else {}
     for name, known in means.items():
