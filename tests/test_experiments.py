@@ -26,7 +26,14 @@ from fusecap.evaluate.cells import (
 )
 from fusecap.evaluate.experiments import table3
 from fusecap.evaluate.experiments.experiment import Results, settings
-from fusecap.evaluate.experiments.run import EXPERIMENTS, Evaluation, as_json, markdown, write
+from fusecap.evaluate.experiments.run import (
+    EXPERIMENTS,
+    Evaluation,
+    as_json,
+    described,
+    markdown,
+    write,
+)
 from fusecap.evaluate.runner import Outcome
 from fusecap.evaluate.tables import Table
 from fusecap.evaluate.twin import TWIN_VERSION, twin_sequences, twin_simulation
@@ -104,6 +111,12 @@ def test_a_failed_cell_is_named_and_the_rest_reported(name):
     assert "**Failed**" in text and "ValueError: broken" in text
     assert "nan (nan)" not in text
     json.dumps(as_json(evaluation), allow_nan=False)
+
+
+def test_a_cell_is_described_by_what_is_unusual():
+    weights = TwinCell(scene="S1 FS3").weights | {"floor": 0.0}
+    cell = TwinCell(scene="S1 FS3", imus=6, weights=weights, offsets={"nose": (0.0, 0.0, 0.1)})
+    assert described(cell) == "S1 FS3, imus=6, weights=floor=0, offsets=given"
 
 
 def test_findings_that_do_not_hold_come_first():
@@ -238,18 +251,18 @@ def fusecap(*arguments: object, **environment: str) -> subprocess.CompletedProce
 
 @pytest.mark.slow
 def test_a_command_solves_reports_and_resumes(tmp_path):
-    command = ("evaluate", "table2", "--quick", "--sequences", "S2 FS1", "--out", tmp_path)
+    command = ("evaluate", "table4", "--quick", "--sequences", "S2 FS1", "--out", tmp_path)
     first = fusecap(*command, "--json")
     assert first.returncode == 0, first.stderr
     report = json.loads(first.stdout)
-    assert report["simulated"] is True and report["cells"] == 2
+    assert report["simulated"] is True and report["cells"] == 3
     cells = sorted((tmp_path / "cells").iterdir())
-    assert len(cells) == 2
+    assert len(cells) == 3
     written = [path.stat().st_mtime_ns for path in cells]
     again = fusecap(*command)
     assert again.returncode == 0 and "simulated twin" in again.stdout
     assert [path.stat().st_mtime_ns for path in cells] == written
-    assert json.loads((tmp_path / "table2.json").read_text())["tables"] == report["tables"]
+    assert json.loads((tmp_path / "table4.json").read_text())["tables"] == report["tables"]
 
 
 def test_misuse_of_an_experiment_is_explained(tmp_path):

@@ -136,14 +136,27 @@ def test_subjects_get_tables_of_their_own(scene):
     assert np.allclose(found.subjects["anna"]["nose"], TRUE.everyone["nose"], atol=1e-3)
 
 
+ELSEWHERE = shifted(
+    **{
+        name.removeprefix("left_"): move * ([1, 1, 1] if name.startswith("left_") else [0, 1, 1])
+        for name, move in zip(
+            [name for name in BODY25.landmark_names if not name.startswith("right_")],
+            np.random.default_rng(1).normal(0.0, 0.008, (25, 3)),
+            strict=False,
+        )
+    }
+)
+"""Every landmark about 14 mm off per axis, as a detector might see it."""
+
+
 @pytest.fixture(scope="module")
 def real_motion():
     """Two people of the demo: motion that the pose prior knows; else its pull shows as offsets."""
-    demo = demo_scene(seconds=2.0)
+    demo = demo_scene(seconds=1.0)
     return simulate(
         demo.subjects,
         demo.rig,
-        BODY25.calibrated(TRUE),
+        BODY25.calibrated(ELSEWHERE),
         rate_hz=demo.rate_hz,
         seed=3,
         keypoint_noise=NO_KEYPOINT_NOISE,
@@ -154,6 +167,7 @@ def solved(scene, landmarks):
     return solve_simulation(replace(scene, landmark_set=landmarks)).take
 
 
+@pytest.mark.slow
 def test_self_calibration_recovers_most_and_stays_symmetric(real_motion):
     found = self_calibrate(
         lambda landmarks: solved(real_motion, landmarks),
@@ -161,7 +175,7 @@ def test_self_calibration_recovers_most_and_stays_symmetric(real_motion):
         BODY25,
         real_motion.detections,
     )
-    true = BODY25.calibrated(TRUE).fractions
+    true = BODY25.calibrated(ELSEWHERE).fractions
     before, after = (np.abs(x - true).mean() for x in (BODY25.fractions, found.landmarks.fractions))
     assert after < 0.6 * before
     moved = found.landmarks.fractions - BODY25.fractions
@@ -175,8 +189,9 @@ def test_self_calibration_recovers_most_and_stays_symmetric(real_motion):
     assert error[1] < error[0]
 
 
+@pytest.mark.slow
 def test_self_calibration_leaves_right_offsets_alone(real_motion):
-    landmarks = BODY25.calibrated(TRUE)
+    landmarks = BODY25.calibrated(ELSEWHERE)
     honest = replace(real_motion, landmark_set=landmarks)
     found = self_calibrate(
         lambda some: solved(honest, some), real_motion.rig, landmarks, real_motion.detections

@@ -176,7 +176,7 @@ def test_the_demo_never_trained_the_prior():
 
 
 def test_the_demo_stands_on_the_floor_and_keeps_apart():
-    names, rate_hz, theta = load_demo_motion()
+    names, _, rate_hz, theta = load_demo_motion()
     assert len(names) == 3 and rate_hz == 60.0 and theta.shape == (3, 720, 66)
     shape = BodyShape.from_height(PAPER21, 1.75)
     joints = [forward_kinematics(shape, t)[0] for t in theta]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from fnmatch import fnmatch
+from typing import Any
 
 import numpy as np
 import pytest
@@ -42,7 +43,8 @@ def test_eight_sequences_of_five_subjects_of_ten_seconds():
 
 
 def test_test_takes_are_held_out_and_training_takes_are_not():
-    trained = set(load_prior(PAPER21).recipe["training_takes"])
+    recipe: Any = load_prior(PAPER21).recipe
+    trained = set(recipe["training_takes"])
     for clip in TEST_CLIPS:
         assert any(fnmatch(clip.take, pattern) for pattern in CMU_HELD_OUT)
         assert clip.take not in trained

@@ -145,9 +145,9 @@ def score_shelf(take: Take, truth_path: Path | str) -> ShelfScore:
     return score_people(take, load_truth(truth_path))
 
 
-def score_people(take: Take, known: ShelfTruth) -> ShelfScore:
+def score_people(take: Take, shelf_truth: ShelfTruth) -> ShelfScore:
     """Score `take` on every frame that has truth; people are matched one to one, frame by frame."""
-    truth = known.points_in_world_m
+    truth = shelf_truth.points_in_world_m
     actors = [actor for actor in ACTORS if actor < len(truth)]
     truth = truth[actors]
     estimate = np.full((len(take.subject_names), *truth.shape[1:]), np.nan)

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache, lru_cache
-from typing import Literal
 from zlib import crc32
 
 import numpy as np
@@ -53,7 +52,6 @@ BONE_DEVIATION = 0.03
 """Standard deviation of every bone's length from the proportions of the subject's stature, alike on
 both sides of the body, at most twice as much."""
 
-GroupName = Literal["duo", "quad", "bystanders", "close"]
 VOLUME_M = (-2.2, 2.2, -2.2, 2.2)
 """Of the scenes with several people: x_min, x_max, z_min, z_max; bystanders stay out of it."""
 
@@ -138,7 +136,7 @@ _BYSTANDERS = (
     _Member(body="S3", clip="group round", centre_m=(-3.3, 0.0), bystander=True),
     _Member(body="S2", clip="group signals", centre_m=(2.9, -1.0), turn_deg=-90.0, bystander=True),
 )
-GROUPS: dict[GroupName, tuple[_Member, ...]] = {
+GROUPS: dict[str, tuple[_Member, ...]] = {
     "duo": _DUO,
     "quad": (
         *_DUO,
@@ -156,7 +154,7 @@ that are held out as well."""
 
 
 def twin_group_simulation(
-    name: GroupName | str,
+    name: str,
     *,
     cameras: int = CAMERAS,
     imus: int = 13,

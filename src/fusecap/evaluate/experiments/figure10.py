@@ -51,7 +51,8 @@ def report(settings: Settings, results: Results) -> Report:
             found = {n: results.mean(chosen, *path) for n, path in (METRICS | BELOW).items()}
             found["foot joints below the floor %"] *= 100
             values[cameras, imus, on] = found
-            rows.append((f"{cameras} cameras, {imus} IMUs", "on" if on else "off", *found.values()))
+            views = f"{cameras} camera{'s' * (cameras > 1)}"
+            rows.append((f"{views}, {imus} IMUs", "on" if on else "off", *found.values()))
     with_floor, without = values[1, 0, True], values[1, 0, False]
     deep, place = "mean depth mm", "position, Procrustes mm"
     return Report(

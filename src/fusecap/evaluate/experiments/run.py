@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -150,20 +149,17 @@ def as_json(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def described(cell: Any) -> str:
-    """A cell in a few words: what differs from the default cell."""
+    """A cell in a few words: what differs from the default cell of its scene."""
     values = asdict(cell)
     scene = values.pop("scene")
     default = asdict(type(cell)(scene=scene))
-    changed = [f"{key}={_short(value)}" for key, value in values.items() if value != default[key]]
+    changed = []
+    for key, value in values.items():
+        usual = default[key]
+        if value == usual:
+            continue
+        if isinstance(value, dict):
+            inner = {k: v for k, v in value.items() if not usual or usual.get(k) != v}
+            value = " ".join(f"{k}={v:g}" for k, v in inner.items()) if usual else "given"
+        changed.append(f"{key}={value}")
     return ", ".join([scene, *changed])
-
-
-def _short(value: Any) -> str:
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{k}: {v}" for k, v in list(value.items())[:6]) + "}"
-    return str(value)
-
-
-def names() -> Sequence[str]:
-    """Of all experiments."""
-    return tuple(EXPERIMENTS)
