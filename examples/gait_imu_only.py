@@ -30,10 +30,6 @@ from fusecap.sources.imu_files import read_imu
 
 TRIAL = "S02-Trial-Walk-1"
 RATE_HZ = 100.0
-ORIENTATION_WEIGHT = 30.0
-"""The paper's weight of 1 was tuned beside cameras; alone against the prior it bends the knees by
-20 deg too much. The prior weighs 0.06 per squared standard deviation, and an orientation λ φ²/4;
-sensors good to 5 deg on the same scale: λ = 4 x 0.06 / 0.087² = 30."""
 CALIBRATION_FRAMES = 50
 SEGMENTS = {
     "hips": ("Pelvis", "qRPV"),
@@ -145,7 +141,6 @@ def write_session(folder: Path, out: Path) -> Path:
     vicon = read_vicon(folder / "vicon_first_400.csv")
     heading = heading_deg(folder)
     lines = ["[session]", 'name = "gait"', f"rate_hz = {RATE_HZ}", "floor = false", ""]
-    lines += ["[estimator]", f"weights = {{ orientation = {ORIENTATION_WEIGHT} }}"]
     lines += ["", "[[subject]]", 'name = "walker"']
     for bone, (sensor, _) in SEGMENTS.items():
         x, y, z, w = bone_from_imu(folder, vicon, bone).as_quat()

@@ -587,3 +587,10 @@ def test_written_session_reads_back_as_the_simulation(tmp_path):
             assert np.allclose(read.accel_in_world_m_s2, made.accel_in_world_m_s2, atol=1e-5)
     truth = load_take(tmp_path / "demo" / "truth.npz")
     assert np.array_equal(truth.theta, scene.truth.theta)
+
+
+def test_views_without_anybody_are_written_and_read_back_as_empty(tmp_path):
+    nobody = replace(NO_KEYPOINT_NOISE, person_miss_share=1.0)
+    simulation = captured(two_and_a_bystander(5), keypoint_noise=nobody)
+    data = open_session(load_session(write_session(simulation, tmp_path / "empty")))
+    assert all(len(people) == 0 for people in data.detections(0).people)

@@ -28,6 +28,7 @@ _HELP = {
     "table4": "Table 4's protocol on the simulated twin: 4 cameras and one, no IMU.",
     "figure9": "Figure 9 on the simulated twin: the weight of the acceleration term.",
     "figure10": "Figure 10 on the simulated twin: the floor term on and off.",
+    "tuning": "How the orientation weight was chosen, on the twin's training takes.",
     "people": "Several people on the simulated twin: two, four, bystanders, close interaction.",
 }
 _COMMON = (
@@ -54,7 +55,7 @@ def _command(name: str) -> Callable[..., None]:
         ] = None,
         seed: Annotated[int, typer.Option(min=0, help="Of the simulated faults.")] = 0,
         weights: Annotated[
-            str, typer.Option(help="default, or paper: with acceleration at 1e-3.")
+            str, typer.Option(help="default, paper, or no-acceleration: the paper's without it.")
         ] = "default",
         quick: Annotated[
             bool, typer.Option("--quick", help="Two sequences and fewer configurations.")

@@ -39,7 +39,7 @@ def simulate(
     ] = None,
     cameras: Annotated[int, typer.Option(min=0, max=64, help="How many.")] = 4,
     layout: Annotated[str, typer.Option(help="ring, or arc: 120 degrees of it.")] = "ring",
-    radius: Annotated[float, typer.Option(min=1.0, help="Of the ring or arc [m].")] = 5.0,
+    radius: Annotated[float, typer.Option(min=1.0, help="Of the ring or arc, in metres.")] = 5.0,
     rig: Annotated[
         Path | None, typer.Option(help="Calibration of cameras of your own (y up, metres).")
     ] = None,
@@ -49,11 +49,11 @@ def simulate(
         str | None, typer.Option(help="Of the cameras [Hz]: one, or one each; default --rate.")
     ] = None,
     camera_offsets: Annotated[
-        str | None, typer.Option(help="When each camera's first frame is exposed [s].")
+        str | None, typer.Option(help="When each camera's first frame is exposed, in seconds.")
     ] = None,
     seconds: Annotated[float | None, typer.Option(min=0.1, help="Only the first.")] = None,
     height: Annotated[
-        str | None, typer.Option(help="Of the subjects [m]: one, or one each; default 1.75.")
+        str | None, typer.Option(help="Of the subjects in metres: one, or one each; default 1.75.")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same bits.")] = 0,
     as_json: Json = False,

@@ -152,7 +152,7 @@ def _imu_csv(imus: SimulatedImus, sensor: int) -> str:
 
 
 def _openpose_json(people: Float[np.ndarray, "n k 3"]) -> str:
-    rows = np.nan_to_num(np.round(people, 3)).reshape(len(people), -1).tolist()
+    rows = [person.ravel().tolist() for person in np.nan_to_num(np.round(people, 3))]
     return json.dumps(
         {
             "version": 1.3,

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -20,8 +20,12 @@ from fusecap.evaluate.tables import Table
 from fusecap.evaluate.twin import twin_sequences
 from fusecap.solve.options import Weights
 
-WEIGHTS: Mapping[str, Weights] = {"default": Weights(), "paper": Weights.paper()}
-"""The solver's own weights, or the paper's as printed: the same, and acceleration at 1e-3."""
+WEIGHTS: Mapping[str, Weights] = {
+    "default": Weights(),
+    "no-acceleration": replace(Weights.paper(), acceleration=0.0),
+    "paper": Weights.paper(),
+}
+"""The solver's own weights; the paper's without its acceleration term; the paper's as printed."""
 
 
 @dataclass(frozen=True, kw_only=True)

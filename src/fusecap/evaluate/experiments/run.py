@@ -19,12 +19,14 @@ from fusecap.evaluate.experiments.table1 import TABLE1
 from fusecap.evaluate.experiments.table2 import TABLE2
 from fusecap.evaluate.experiments.table3 import TABLE3
 from fusecap.evaluate.experiments.table4 import TABLE4
+from fusecap.evaluate.experiments.tuning import TUNING
 from fusecap.evaluate.runner import Outcome, Progress, code_version, run_cells
 from fusecap.evaluate.twin import TWIN_VERSION
 from fusecap.sinks.files import written_whole
 
 EXPERIMENTS = {
-    each.name: each for each in (TABLE1, FIGURE7, TABLE2, TABLE3, TABLE4, FIGURE9, FIGURE10, PEOPLE)
+    each.name: each
+    for each in (TABLE1, FIGURE7, TABLE2, TABLE3, TABLE4, FIGURE9, FIGURE10, PEOPLE, TUNING)
 }
 _HOLDS = {False: "does NOT hold", None: "undecided", True: "holds"}
 
@@ -105,11 +107,12 @@ def write(evaluation: Evaluation, out: Path) -> list[Path]:
 def markdown(evaluation: Evaluation) -> str:
     """The whole report, what fell short first."""
     settings = evaluation.settings
+    scenes = dict.fromkeys(cell.scene for cell in evaluation.experiment.cells(settings))
     lines = [
         f"## {evaluation.experiment.title}: simulated twin v{TWIN_VERSION}",
         "",
         f"`{evaluation.command}`, {datetime.now(UTC):%Y-%m-%d}, fusecap {code_version()}, seed "
-        f"{settings.seed}, weights: {settings.weights}, sequences: {', '.join(settings.sequences)}."
+        f"{settings.seed}, weights: {settings.weights}, scenes: {', '.join(scenes)}."
         " **Simulated**: no camera, sensor or person was there; see docs/simulation.md.",
         "",
     ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from fusecap.evaluate.cells import TwinCell
 from fusecap.evaluate.experiments.experiment import (
+    WEIGHTS,
     Experiment,
     Finding,
     Report,
@@ -23,19 +24,22 @@ ROWS = {
 OTHERS = {"0 cameras, 6 IMUs": "DIP: 59.6, 15.8", "1 camera, 13 IMUs": "VIP: 26.0, 12.1"}
 
 INPUTS = ((0, 6), (0, 13), (1, 13), (8, 13))
-STRONGER = 10.0
-"""Weight of E_R that the second table tries; chosen on training takes."""
+PRINTED = 1.0
+"""Weight of E_R in the paper."""
 
 
-def _row(settings: Settings, cameras: int, imus: int, orientation: float = 1.0) -> list[TwinCell]:
+def _row(
+    settings: Settings, cameras: int, imus: int, orientation: float | None = None
+) -> list[TwinCell]:
+    """Cells with the weights asked for, or with another one for E_R."""
+    changes = {} if orientation is None else {"weights": {"orientation": orientation}}
     return [
-        settings.cell(scene, cameras=cameras, imus=imus, weights={"orientation": orientation})
-        for scene in settings.sequences
+        settings.cell(scene, cameras=cameras, imus=imus, **changes) for scene in settings.sequences
     ]
 
 
 def cells(settings: Settings) -> list[TwinCell]:
-    rows = [_row(settings, *given, weight) for given in INPUTS for weight in (1.0, STRONGER)]
+    rows = [_row(settings, *given, weight) for given in INPUTS for weight in (PRINTED, None)]
     return [cell for sequence in zip(*rows, strict=True) for cell in sequence]
 
 
@@ -65,7 +69,7 @@ def report(settings: Settings, results: Results) -> Report:
                     below(turn.mean, float(paper_deg.split()[0]), 1.25),
                 ),
                 why="E_R at its printed weight of 1 is weak beside the prior: see the table of "
-                "heavier IMUs.",
+                "that weight and the one in use.",
             )
         )
     return Report(
@@ -82,29 +86,30 @@ def report(settings: Settings, results: Results) -> Report:
                 ),
                 rows=tuple(rows),
             ),
-            _heavier(settings, results),
+            _weight_of_imus(settings, results),
         ),
         findings=tuple(findings),
     )
 
 
-def _heavier(settings: Settings, results: Results) -> Table:
+def _weight_of_imus(settings: Settings, results: Results) -> Table:
     rows: list[tuple[Value, ...]] = []
+    in_use = WEIGHTS[settings.weights].orientation
     for cameras, imus in INPUTS:
         means = [
             results.spread(_row(settings, cameras, imus, weight), "score", metric).mean
             for metric in ("aligned_error_mm", "orientation_error_deg")
-            for weight in (1.0, STRONGER)
+            for weight in (PRINTED, None)
         ]
         rows.append((f"{cameras} camera{'s' * (cameras != 1)}, {imus} IMUs", *means))
     return Table(
-        title=f"Heavier IMUs: E_R with weight 1 (as printed) and {STRONGER:g}",
+        title=f"E_R with weight {PRINTED:g}, as printed, and the one in use, {in_use:g}",
         columns=(
             "input",
-            "aligned position mm, 1",
-            f"aligned position mm, {STRONGER:g}",
-            "orientation, global deg, 1",
-            f"orientation, global deg, {STRONGER:g}",
+            f"aligned position mm, {PRINTED:g}",
+            f"aligned position mm, {in_use:g}",
+            f"orientation, global deg, {PRINTED:g}",
+            f"orientation, global deg, {in_use:g}",
         ),
         rows=tuple(rows),
     )
