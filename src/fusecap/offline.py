@@ -13,7 +13,6 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -86,45 +85,43 @@ def solve_instants(
 ) -> Solved:
     """Both passes over recorded instants."""
     started = time.perf_counter()
-    with ThreadPoolExecutor() as pool:
-        pipeline = Pipeline(
-            rig=scene.rig,
-            landmarks=scene.landmarks,
-            skeleton=scene.skeleton,
-            prior=scene.prior,
-            sorter=scene.sorter,
-            subjects=scene.subjects,
-            options=scene.options,
-            pool=pool,
-        )
-        tracked = _first_pass(pipeline, instants, progress)
-        reprojection = Reprojection(scene.rig, scene.landmarks)
-        builder = TakeBuilder(
-            skeleton=scene.skeleton,
-            rate_hz=scene.rate_hz,
-            subject_names=_in_order([model.name for model in scene.subjects], tracked.shapes),
-            provenance=provenance(
-                options={"solver": asdict(scene.options), "cameras": list(scene.rig.names)},
-                session_sha256=session_sha256,
-                simulated=simulated,
-            ),
-        )
-        second = _SecondPass(scene, pipeline, tracked)
-        solve_s, statuses = [], Counter()
-        interrupted = tracked.interrupted
-        try:
-            for instant, updates in enumerate(tracked.updates):
-                detections = instants.detections(instant)
-                estimates = second.step(detections, instants.readings(instant), updates, pool)
-                builder.add(detections.timestamp_ns, [estimate for estimate, _ in estimates])
-                for estimate, keypoints in estimates:
-                    reprojection.add(estimate, keypoints)
-                    solve_s.append(estimate.solve_s)
-                    statuses[estimate.status.name.lower()] += 1
-                if progress:
-                    progress("solving", instant + 1, len(tracked.updates))
-        except KeyboardInterrupt:
-            interrupted = True
+    pipeline = Pipeline(
+        rig=scene.rig,
+        landmarks=scene.landmarks,
+        skeleton=scene.skeleton,
+        prior=scene.prior,
+        sorter=scene.sorter,
+        subjects=scene.subjects,
+        options=scene.options,
+    )
+    tracked = _first_pass(pipeline, instants, progress)
+    reprojection = Reprojection(scene.rig, scene.landmarks)
+    builder = TakeBuilder(
+        skeleton=scene.skeleton,
+        rate_hz=scene.rate_hz,
+        subject_names=_in_order([model.name for model in scene.subjects], tracked.shapes),
+        provenance=provenance(
+            options={"solver": asdict(scene.options), "cameras": list(scene.rig.names)},
+            session_sha256=session_sha256,
+            simulated=simulated,
+        ),
+    )
+    second = _SecondPass(scene, pipeline, tracked)
+    solve_s, statuses = [], Counter()
+    interrupted = tracked.interrupted
+    try:
+        for instant, updates in enumerate(tracked.updates):
+            detections = instants.detections(instant)
+            estimates = second.step(detections, instants.readings(instant), updates)
+            builder.add(detections.timestamp_ns, [estimate for estimate, _ in estimates])
+            for estimate, keypoints in estimates:
+                reprojection.add(estimate, keypoints)
+                solve_s.append(estimate.solve_s)
+                statuses[estimate.status.name.lower()] += 1
+            if progress:
+                progress("solving", instant + 1, len(tracked.updates))
+    except KeyboardInterrupt:
+        interrupted = True
     take = builder.build()
     solve_ms = np.array(solve_s or [np.nan]) * 1e3
     return Solved(
@@ -215,7 +212,6 @@ class _SecondPass:
         detections: Detections,
         readings: Mapping[str, ImuReading],
         updates: Sequence[TrackUpdate],
-        pool: ThreadPoolExecutor,
     ) -> list[tuple[Estimate, np.ndarray]]:
         """Estimates, each with the keypoints (C, K, 3) it was solved from."""
 
@@ -227,7 +223,7 @@ class _SecondPass:
             estimate = estimator.follow(update.track_id, observation, update.landmarks_in_world_m)
             return estimate and (estimate, observation.keypoints)
 
-        return [solved for solved in pool.map(solve, updates) if solved]
+        return [solved for solved in map(solve, updates) if solved]
 
 
 def _describe(take: Take, subject: int) -> dict[str, float]:

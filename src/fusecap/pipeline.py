@@ -5,7 +5,8 @@
          └───────────── landmarks predicted for the next instant ◀───────┘
 
 `Pipeline.step` takes one instant and holds no clock, so a live run and its replay give the same
-bits. Estimators of different people run on threads: the kernels do not hold the GIL.
+bits. Estimators of different people share nothing and may run on threads: the kernels do not hold
+the GIL.
 """
 
 from __future__ import annotations
@@ -75,7 +76,11 @@ class Pipeline:
         options: SolverOptions | None = None,
         pool: ThreadPoolExecutor | None = None,
     ) -> None:
-        """Without a sorter (no camera) every subject is solved from its sensors alone."""
+        """Without a sorter (no camera) every subject is solved from its sensors alone.
+
+        With a `pool` subjects are solved on its threads, to the same bits. A solve is so short that
+        this pays only where solves are made longer (docs/benchmarks.md, "How it grows").
+        """
         self._rig = rig
         self._landmarks = landmarks
         self._skeleton = skeleton
