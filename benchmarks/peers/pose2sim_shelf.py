@@ -1,7 +1,7 @@
 """Pose2Sim on Shelf beside fusecap: same detections, same truth, same 3D PCP, seconds.
 
-    uv venv /tmp/pose2sim && uv pip install --python /tmp/pose2sim pose2sim
-    uv run python benchmarks/peers/pose2sim_shelf.py SHELF_FOLDER /tmp/pose2sim/bin/python
+    uv venv pose2sim-env && uv pip install --python pose2sim-env pose2sim
+    uv run python benchmarks/peers/pose2sim_shelf.py SHELF_FOLDER pose2sim-env/bin/python
 
 SHELF_FOLDER is that of benchmarks/shelf.py. Pose2Sim stays in its own environment and keeps its
 default settings. Its BODY_25 leaves out the ears, which the chin of the scoring rule needs, so they
