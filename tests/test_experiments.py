@@ -94,7 +94,7 @@ def _offsets(monkeypatch):
 def test_every_experiment_reports_and_calls_itself_simulated(name, tmp_path):
     evaluation = evaluated(name)
     files = write(evaluation, tmp_path)
-    assert {"md", "json", "csv"} <= {path.suffix[1:] for path in files}
+    assert {"md", "json", "csv", "png"} <= {path.suffix[1:] for path in files}
     text = (tmp_path / f"{name}.md").read_text()
     assert f"simulated twin v{TWIN_VERSION}" in text.splitlines()[0]
     assert f"`fusecap evaluate {name}`" in text and "seed 3" in text

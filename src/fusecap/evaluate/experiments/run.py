@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from fusecap.evaluate.cells import plain, solve_cell
+from fusecap.evaluate.experiments.bars import bars
 from fusecap.evaluate.experiments.experiment import Experiment, Finding, Report, Results, Settings
 from fusecap.evaluate.experiments.figure7 import FIGURE7
 from fusecap.evaluate.experiments.figure9 import FIGURE9
@@ -90,10 +91,11 @@ def write(evaluation: Evaluation, out: Path) -> list[Path]:
         f"{name}.json": json.dumps(as_json(evaluation), indent=1).encode(),
     }
     tables = evaluation.report.tables
+    plots = evaluation.report.plots or {"": bars(tables[0])}
     for index, table in enumerate(tables):
         part = f"_{index + 1}" if len(tables) > 1 else ""
         files[f"{name}{part}.csv"] = table.csv().encode()
-    for part, figure in evaluation.report.plots.items():
+    for part, figure in plots.items():
         png = io.BytesIO()
         figure.suptitle(f"{evaluation.experiment.title} (simulated twin v{TWIN_VERSION})")
         figure.savefig(png, dpi=80, format="png")
