@@ -18,17 +18,6 @@ from fusecap.body.shape import BodyShape
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ImuSample:
-    """One reading of one sensor, as it was measured."""
-
-    timestamp_ns: int
-    orientation_wxyz: Float[np.ndarray, "4"]
-    """imu_world_from_imu."""
-    accel_m_s2: Float[np.ndarray, "3"]
-    """Specific force in the imu frame (at rest +9.8 along up); NaN where not measured."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class ImuReading:
     """What the I sensors of one subject say about its bones at one instant, in the world."""
 

@@ -30,7 +30,7 @@ _BVH_NAMES = {
     "Head": "head",
 } | {
     f"{bvh_side}{bvh}": f"{side}{asf}"
-    for bvh_side, short_side, side in (("Left", "L", "l"), ("Right", "R", "r"))
+    for bvh_side, side in (("Left", "l"), ("Right", "r"))
     for bvh, asf in (
         ("Shoulder", "clavicle"),
         ("Arm", "humerus"),

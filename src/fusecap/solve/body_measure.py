@@ -80,11 +80,6 @@ class BodyMeasure:
                     kept.append(length)
             del kept[: -self.max_samples]
 
-    @property
-    def sample_count(self) -> int:
-        """Samples of the segment seen most often."""
-        return max((len(kept) for kept in self._samples.values()), default=0)
-
     def shape(self) -> BodyShape | None:
         """The body measured so far; None until some segment has enough samples."""
         lengths = {

@@ -17,9 +17,6 @@ from fusecap.evaluate.experiments.experiment import (
 )
 from fusecap.evaluate.tables import Table, Value
 
-PAPER_MM = (62.5, 85.0)
-"""Not used to judge: other people, motion, detector and skeleton."""
-
 
 def _four(settings: Settings, scene: str) -> TwinCell:
     return settings.cell(scene, cameras=8, every_other_camera=True, imus=0)
