@@ -32,7 +32,7 @@ from fusecap.evaluate.keypoint_noise import (
     occluded,
     together,
 )
-from fusecap.offline import solve_session
+from fusecap.offline.solve import solve_session
 from fusecap.sources.session import load_session
 from fusecap.sources.session_data import SessionData, open_session
 

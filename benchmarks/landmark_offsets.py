@@ -41,7 +41,7 @@ from fusecap.evaluate.twin import (
     twin_simulation,
     twin_training_sequences,
 )
-from fusecap.offline import solve_instants
+from fusecap.offline.solve import solve_instants
 from fusecap.scene import SessionInstants, scene_of
 from fusecap.sinks.take import Take
 from fusecap.sources.session import load_session

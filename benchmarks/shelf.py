@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 
 from fusecap.evaluate.shelf import ShelfScore, score_shelf
-from fusecap.offline import solve_session
+from fusecap.offline.solve import solve_session
 from fusecap.sinks.take import Take, save_take
 from fusecap.sources.session import load_session
 from fusecap.sources.session_data import open_session

@@ -14,7 +14,7 @@ from fusecap.evaluate.demo_scene import demo_scene
 from fusecap.evaluate.score import score_take
 from fusecap.evaluate.simulated_session import write_session
 from fusecap.evaluate.simulated_solve import solve_simulation
-from fusecap.offline import Solved, solve_session
+from fusecap.offline.solve import Solved, solve_session
 from fusecap.sinks.take import load_take
 from fusecap.sources.doctor import diagnose
 from fusecap.sources.session import load_session

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fusecap.evaluate.shelf import score_shelf
-from fusecap.offline import solve_session
+from fusecap.offline.solve import solve_session
 from fusecap.sources.doctor import diagnose
 from fusecap.sources.session import load_session
 from fusecap.sources.session_data import open_session

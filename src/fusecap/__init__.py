@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from fusecap.body.skeleton import EXTENDED23, PAPER21, Skeleton
     from fusecap.errors import FusecapError
     from fusecap.geometry.camera import Camera, Rig
-    from fusecap.offline import Solved, SolveReport, solve_session
+    from fusecap.offline.solve import Solved, SolveReport, solve_session
     from fusecap.sinks.take import Take, load_take, save_take
     from fusecap.solve.estimator import Estimator, SubjectModel
     from fusecap.solve.options import SolverOptions, Weights
@@ -36,9 +36,9 @@ _HOME = {
     "FusecapError": "errors",
     "Camera": "geometry.camera",
     "Rig": "geometry.camera",
-    "Solved": "offline",
-    "SolveReport": "offline",
-    "solve_session": "offline",
+    "Solved": "offline.solve",
+    "SolveReport": "offline.solve",
+    "solve_session": "offline.solve",
     "Take": "sinks.take",
     "load_take": "sinks.take",
     "save_take": "sinks.take",

@@ -51,7 +51,7 @@ from fusecap.errors import InputError
 from fusecap.evaluate.metrics import Summary, summarize
 from fusecap.geometry.camera import Rig
 from fusecap.geometry.triangulation import triangulate
-from fusecap.offline import Progress, solve_instants
+from fusecap.offline.solve import Progress, solve_instants
 from fusecap.scene import SessionInstants, scene_of
 from fusecap.sinks.take import Take
 from fusecap.sources.session_data import SessionData

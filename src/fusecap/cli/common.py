@@ -14,7 +14,7 @@ from rich.console import Console
 from fusecap.errors import nearest
 
 if TYPE_CHECKING:
-    from fusecap.offline import Solved
+    from fusecap.offline.solve import Solved
     from fusecap.sinks.take import Take
 
 err = Console(stderr=True, highlight=False)

@@ -49,7 +49,7 @@ def session(
 ) -> None:
     """Solve a session and score it against its truth, as `fusecap simulate` writes it."""
     from fusecap.evaluate.datasets.session import session_table
-    from fusecap.offline import solve_session
+    from fusecap.offline.solve import solve_session
     from fusecap.sinks.take import load_take
     from fusecap.sources.session import load_session
     from fusecap.sources.session_data import open_session

@@ -24,7 +24,7 @@ from fusecap.cli.common import (
 from fusecap.errors import InputError
 
 if TYPE_CHECKING:
-    from fusecap.offline import Solved
+    from fusecap.offline.solve import Solved
 
 EXAMPLE = "Example: fusecap solve recordings/duo --export bvh --json > report.json"
 
@@ -42,7 +42,7 @@ def solve(
     as_json: Json = False,
 ) -> None:
     """Solve a recorded session: keypoints and IMU files to each person's motion."""
-    from fusecap.offline import solve_session
+    from fusecap.offline.solve import solve_session
     from fusecap.sinks.files import safe_name
     from fusecap.sources.session import load_session
     from fusecap.sources.session_data import open_session

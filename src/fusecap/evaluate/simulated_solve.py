@@ -8,7 +8,7 @@ import numpy as np
 
 from fusecap.body.prior import PosePrior, load_prior
 from fusecap.evaluate.simulator import Simulation
-from fusecap.offline import Progress, Solved, solve_instants
+from fusecap.offline.solve import Progress, Solved, solve_instants
 from fusecap.scene import Scene, make_sorter
 from fusecap.solve.estimator import SubjectModel
 from fusecap.solve.options import SolverOptions

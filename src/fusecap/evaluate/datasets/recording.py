@@ -18,7 +18,7 @@ from fusecap.body.prior import load_prior
 from fusecap.body.skeleton import PAPER21, Skeleton
 from fusecap.errors import InputError
 from fusecap.geometry.camera import Rig
-from fusecap.offline import Progress, Solved, solve_instants
+from fusecap.offline.solve import Progress, Solved, solve_instants
 from fusecap.scene import Scene, make_sorter
 from fusecap.sinks.take import Take
 from fusecap.solve.estimator import SubjectModel
