@@ -24,3 +24,11 @@ class Finding:
             if self.remedy
             else (f"{self.where}: {self.found}")
         )
+
+
+class Findings(list[Finding]):
+    """Findings as a check collects them."""
+
+    def add(self, severity: Severity, where: str, found: str, remedy: str = "") -> None:
+        """One more."""
+        self.append(Finding(severity=severity, where=where, found=found, remedy=remedy))

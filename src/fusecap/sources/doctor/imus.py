@@ -1,0 +1,87 @@
+"""Sensor files: rates, gaps, units, gravity."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from fusecap.errors import FusecapError
+from fusecap.sources.findings import Findings
+from fusecap.sources.imu_files import read_imu
+from fusecap.sources.imu_files.track import GRAVITY_M_S2, ImuTrack
+from fusecap.sources.session import ImuSettings, Session
+from fusecap.sources.session_data import mount
+
+
+def check_imus(session: Session, findings: Findings) -> list[ImuTrack | None]:
+    tracks: list[ImuTrack | None] = []
+    for subject in session.subjects:
+        for imu in subject.imus:
+            where = f"imu '{imu.bone}' of '{subject.name}'"
+            track = None
+            if imu.file.is_file():
+                try:
+                    track = read_imu(
+                        imu.file, format=imu.format, sensor=imu.sensor, rate_hz=imu.rate_hz
+                    )
+                    mount(subject.model_copy(update={"imus": (imu,)}), [track])
+                except FusecapError as error:
+                    findings.add("error", where, str(error))
+            if track is not None:
+                _check_imu(where, imu, track, findings)
+            tracks.append(track)
+    return tracks
+
+
+def _check_imu(where: str, imu: ImuSettings, track: ImuTrack, findings: Findings) -> None:
+    for note in track.notes:
+        findings.add("warning", where, note)
+    if imu.rate_hz is not None and abs(track.rate_hz / imu.rate_hz - 1) > 0.02:
+        findings.add(
+            "warning",
+            where,
+            f"samples come at {track.rate_hz:.1f} Hz, rate_hz says {imu.rate_hz:g}",
+            "correct rate_hz, or remove it",
+        )
+    if track.rate_hz < 20:
+        findings.add(
+            "warning",
+            where,
+            f"samples come at {track.rate_hz:.1f} Hz",
+            "record at 60 Hz or more; below 20 Hz fast motion is lost",
+        )
+    _check_gravity(where, imu, track, findings)
+
+
+def _check_gravity(where: str, imu: ImuSettings, track: ImuTrack, findings: Findings) -> None:
+    """On average an accelerometer reads gravity, upwards in the world."""
+    measured = np.isfinite(track.accel_m_s2).all(axis=1)
+    if measured.sum() < 10:
+        return
+    world_from_imu = Rotation.from_quat(track.orientation_wxyz[measured][:, [1, 2, 3, 0]])
+    force = np.median(world_from_imu.apply(track.accel_m_s2[measured]), axis=0)
+    size = float(np.median(np.linalg.norm(track.accel_m_s2[measured], axis=1)))
+    if abs(size - 1) < 0.3:
+        findings.add(
+            "error",
+            where,
+            f"the accelerometer reads {size:.2f} on average: it is in units of g",
+            f"multiply by {GRAVITY_M_S2}; expected m/s2",
+        )
+    elif size < 4:
+        findings.add(
+            "error",
+            where,
+            f"the accelerometer reads {size:.1f} m/s2 on average: gravity has been removed",
+            "export the raw acceleration (specific force)",
+        )
+    else:
+        up = np.array([0.0, 1.0, 0.0] if imu.imu_up == "y" else [0.0, 0.0, 1.0])
+        angle = np.degrees(np.arccos(np.clip(force @ up / np.linalg.norm(force), -1, 1)))
+        if angle > 15:
+            findings.add(
+                "warning",
+                where,
+                f"gravity points {angle:.0f} deg away from the sensor world's {imu.imu_up} axis",
+                "check imu_up, and that the quaternion is w, x, y, z from sensor to world",
+            )
