@@ -22,6 +22,7 @@ from fusecap.cli import (
     evaluate_datasets,
     evaluate_twin,
     export,
+    init,
     simulate,
     solve,
 )
@@ -61,6 +62,7 @@ app.command(epilog=demo.EXAMPLE)(demo.demo)
 app.command(epilog=solve.EXAMPLE)(solve.solve)
 app.command(epilog=export.EXAMPLE)(export.export)
 app.command(epilog=doctor.EXAMPLE)(doctor.doctor)
+app.command(epilog=init.EXAMPLE)(init.init)
 app.command(epilog=simulate.EXAMPLE)(simulate.simulate)
 calibrate.command(epilog=calibrate_offsets.EXAMPLE)(calibrate_offsets.offsets)
 calibrate.command(epilog=calibrate_prior.EXAMPLE)(calibrate_prior.prior)

@@ -1,0 +1,73 @@
+"""A first `session.toml` from what a folder holds; what it cannot know is left as a comment."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from fusecap.body.skeleton import Skeleton, skeleton_named
+from fusecap.errors import InputError
+from fusecap.sources.folder_survey import FolderSurvey, FoundSensor
+
+SKELETON = "paper21"
+
+
+def draft(found: FolderSurvey) -> str:
+    """The text of the file; raises `InputError` for a folder without a recording."""
+    if found.nothing:
+        raise InputError(
+            f"{found.folder}: no video, no keypoint folder and no sensor file; put the recording "
+            "into this folder"
+        )
+    lines = ["[session]", f"name = {_quoted(found.folder.resolve().name)}"]
+    if found.calibration is not None:
+        lines.append(f"calibration = {_quoted(found.calibration.as_posix())}")
+        if found.calibration.name.endswith((".qca.txt", ".qca")):
+            lines.append('up = "z"   # as Qualisys has it')
+    elif found.videos or found.keypoints:
+        lines += [
+            "# fusecap calibrate intrinsics and fusecap calibrate extrinsics write it:",
+            'calibration = "calibration.toml"',
+        ]
+    return "\n".join([*lines, *_cameras(found), *_subject(found)]) + "\n"
+
+
+def _cameras(found: FolderSurvey) -> Iterator[str]:
+    sources = {path.stem: ("video", path) for path in found.videos}
+    sources |= {name: ("keypoints", path) for name, path in found.keypoints.items()}
+    for name in sorted(sources):
+        key, path = sources[name]
+        yield from ("", "[[camera]]", f"name = {_quoted(name)}")
+        yield f"{key} = {_quoted(path.as_posix())}"
+        if key == "keypoints" and found.keypoint_format:
+            yield f"format = {_quoted(found.keypoint_format)}"
+        if found.cameras and name not in found.cameras:
+            yield f"# the calibration has no camera of this name, only: {', '.join(found.cameras)}"
+
+
+def _subject(found: FolderSurvey) -> Iterator[str]:
+    if not found.sensors:
+        return
+    skeleton = skeleton_named(SKELETON)
+    yield from ("", "[[subject]]", 'name = "subject"', "# height_m = 1.75")
+    yield "# tpose_s = [2.0, 4.0]   # when the subject stands in the T-pose"
+    taken: set[str] = set()
+    for sensor in found.sensors:
+        known = _usable(sensor, skeleton, taken)
+        mark = "" if known else "# "
+        yield from ("", f"{mark}[[subject.imu]]")
+        yield f"{mark}bone = {_quoted(sensor.bone or 'which?')}"
+        yield f"{mark}file = {_quoted(sensor.file.as_posix())}"
+        yield f"{mark}format = {_quoted(sensor.format)}"
+        if sensor.sensor is not None:
+            yield f"{mark}sensor = {_quoted(sensor.sensor)}"
+        if known:
+            taken.add(str(sensor.bone))
+
+
+def _usable(sensor: FoundSensor, skeleton: Skeleton, taken: set[str]) -> bool:
+    return sensor.bone in skeleton.bone_names and sensor.bone not in taken
+
+
+def _quoted(text: str) -> str:
+    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
+    return f'"{escaped}"'
