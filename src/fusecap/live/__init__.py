@@ -1,0 +1,1 @@
+"""What runs in real time: the only room that owns clocks, threads and sockets."""
