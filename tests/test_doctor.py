@@ -63,7 +63,7 @@ def test_turned_camera_disagrees_with_the_others(tmp_path):
     (tmp_path / "calibration.toml").write_text(calibration_toml(Rig(cameras=tuple(cameras))))
     findings = [f for f in diagnose(path) if "disagrees" in f.found]
     assert [f.where for f in findings] == ["camera 'cam2'"]
-    assert "recalibrate" in findings[0].remedy
+    assert "fusecap calibrate extrinsics" in findings[0].remedy
 
 
 @pytest.mark.slow
@@ -208,3 +208,20 @@ def test_shelf_is_sound_and_its_wrong_axis_is_found(data_dir, tmp_path):
     edit(tmp_path / "session.toml", 'name = "2"', 'name = "2"\noffset_s = 0.4')
     late = [f for f in diagnose(tmp_path) if "disagrees" in f.found]
     assert [f.where for f in late] == ["camera '2'"] and "-0.40 s" in late[0].remedy
+
+
+def test_folder_without_a_session_file_is_told_the_next_commands(tmp_path):
+    (tmp_path / "cam1.mp4").write_bytes(b"")
+    (tmp_path / "00B421E6.csv").write_text("time_s,qw,qx,qy,qz\n0,1,0,0,0\n")
+    found = {finding.where: str(finding) for finding in diagnose(tmp_path)}
+    assert "1 video, 1 sensor" in found["session.toml"]
+    assert "fusecap init" in found["session.toml"]
+    assert "empty file" in found["camera 'cam1'"]
+    assert "fusecap calibrate board" in found["calibration"]
+    assert "--identify" in found["sensors"]
+    assert "fusecap calibrate sync" in found["clocks"]
+
+
+def test_empty_folder_is_told_what_belongs_there(tmp_path):
+    (only,) = diagnose(tmp_path)
+    assert only.severity == "error" and "no video" in only.found

@@ -14,8 +14,8 @@ from fusecap.errors import FusecapError, InputError
 from fusecap.sources.calibration_files import load_rig
 from fusecap.sources.imu_files import sensor_names
 from fusecap.sources.sensor_bones import bone_of
+from fusecap.sources.video import VIDEO_SUFFIXES
 
-VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mts", ".mpg")
 DEEPEST = 3
 """Folders below the surveyed one."""
 SNIFFED_CHARACTERS = 4096

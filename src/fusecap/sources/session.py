@@ -301,7 +301,10 @@ class Session(_Table):
         if not self.cameras and not any(subject.imus for subject in self.subjects):
             problems.append("there is neither a [[camera]] nor a [[subject.imu]]: nothing to solve")
         if self.cameras and self.settings.calibration is None:
-            problems.append("[session] calibration is missing; cameras need a calibration file")
+            problems.append(
+                "[session] calibration is missing; cameras need a calibration file, as "
+                "fusecap calibrate extrinsics writes it"
+            )
         for subject in self.subjects:
             problems += _unknown_bones(self.skeleton, subject)
         if problems:

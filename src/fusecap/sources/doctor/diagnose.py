@@ -6,18 +6,22 @@ from pathlib import Path
 
 from fusecap.errors import FusecapError
 from fusecap.geometry.camera import Rig
+from fusecap.sources.doctor.folder import check_folder
 from fusecap.sources.doctor.imus import check_imus
 from fusecap.sources.doctor.keypoints import check_keypoints
 from fusecap.sources.doctor.views import check_views
 from fusecap.sources.findings import Finding, Findings, Severity
 from fusecap.sources.keypoint_files import KeypointTrack
-from fusecap.sources.session import Session, missing_files, parse_session, session_file
+from fusecap.sources.session import FILE_NAME, Session, missing_files, parse_session, session_file
 from fusecap.sources.session_data import Progress, open_rig, solve_times_s, unplaced_wearers
 
 
 def diagnose(path: Path | str, progress: Progress | None = None) -> list[Finding]:
     """Everything that is wrong or odd, errors first; empty for a session without a flaw."""
     findings = Findings()
+    if Path(path).is_dir() and not (Path(path) / FILE_NAME).is_file():
+        check_folder(Path(path), findings)
+        return _sorted(findings)
     try:
         session = parse_session(path)
     except FusecapError as error:
@@ -40,6 +44,10 @@ def diagnose(path: Path | str, progress: Progress | None = None) -> list[Finding
         except FusecapError as error:
             findings.add("error", str(session_file(path).name), str(error).split(": ", 1)[-1])
     check_views(session, rig, tracks, findings)
+    return _sorted(findings)
+
+
+def _sorted(findings: Findings) -> list[Finding]:
     order: dict[Severity, int] = {"error": 0, "warning": 1, "info": 2}
     return sorted(findings, key=lambda finding: order[finding.severity])
 

@@ -64,7 +64,8 @@ def _check_looseness(rig: Rig, pairs_px: np.ndarray, findings: Findings) -> None
         "calibration",
         f"cameras disagree by a median of {np.nanmedian(pairs_px):.0f} px; worst are "
         f"'{rig.cameras[i].name}' and '{rig.cameras[j].name}' with {pairs_px[i, j]:.0f} px",
-        "recalibrate the extrinsics, or check offset_s and rate_hz",
+        "fusecap calibrate sync where clocks may differ; else fusecap calibrate extrinsics "
+        "--from-people, which needs no board",
     )
 
 
@@ -79,11 +80,14 @@ def _report_disagreement(
     frames = np.round(SHIFT_RANGE_S * tracks[index].rate_hz)
     shifts_s = np.arange(-frames, frames + 1, max(1, frames // 20)) / tracks[index].rate_hz
     shift_s, left_px = view_agreement.best_shift_s(rig, tracks, index, times_s[::3], shifts_s)
-    remedy = "recalibrate it, or check its offset_s"
+    remedy = (
+        "if it was moved: fusecap calibrate extrinsics, --from-people without a board; "
+        "if its clock is off: fusecap calibrate sync"
+    )
     if left_px < 0.5 * median_px:
         remedy = (
             f"add about {shift_s:+.2f} s to its offset_s: then {left_px:.0f} px are left; "
-            "or recalibrate it"
+            "fusecap calibrate sync finds it exactly"
         )
     findings.add(
         "warning",
@@ -119,7 +123,7 @@ def _check_people(
             f"people stand {angle:.0f} deg away from up",
             f'set up = "{axis}" under [session]'
             if axis != session.settings.up
-            else "rotate the calibration's world so that an axis points up",
+            else "fusecap calibrate world turns the calibration so that y points up",
         )
         return
     low, high = PEOPLE_HEIGHT_M
@@ -128,7 +132,7 @@ def _check_people(
             "warning",
             "calibration",
             f"people measure {tall:.2f} m from ankle to head",
-            "the calibration is not in metres: scale its translations",
+            "the calibration is not in metres: fusecap calibrate world scales it",
         )
         return
     ankle_m = float(np.median(feet[:, 1]))
@@ -137,5 +141,5 @@ def _check_people(
             "warning",
             "calibration",
             f"ankles are {ankle_m:+.2f} m from the floor (y = 0)",
-            "move the origin to the floor, or set floor = false",
+            "fusecap calibrate world moves the origin to the floor; or set floor = false",
         )
