@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from fusecap.doctor import diagnose
 from fusecap.geometry.camera import Rig
-from fusecap.sources.doctor import diagnose
 from session_files import calibration_toml, edit, imu_csv, ring, write_session
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fusecap.doctor import diagnose
 from fusecap.errors import CalibrationError, InputError, SessionError
 from fusecap.evaluate.demo_scene import demo_scene
 from fusecap.evaluate.score import score_take
@@ -16,7 +17,6 @@ from fusecap.evaluate.simulated_session import write_session
 from fusecap.evaluate.simulated_solve import solve_simulation
 from fusecap.offline.solve import Solved, solve_session
 from fusecap.sinks.take import load_take
-from fusecap.sources.doctor import diagnose
 from fusecap.sources.session import load_session
 from fusecap.sources.session_data import open_session
 

@@ -86,7 +86,6 @@ def test_several_errors_are_all_listed(tmp_path):
         ("", "[session]"),
         ('[[session]]\nname = "x"\n', "write [session]"),
         ("[session", "not valid TOML"),
-        (CAMERA.replace('calibration = "c.toml"\n', ""), "calibration is missing"),
         (CAMERA.replace('name = "a"', 'name = "a"\nup = "x"'), "y, z, -y"),
         (CAMERA.replace('name = "a"', 'name = "a"\nfloor = 1'), "true or false"),
         (CAMERA.replace('name = "a"', 'name = "a"\nmax_subjects = 0'), "at least 1"),

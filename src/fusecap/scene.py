@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from fusecap.sources.session_data import SessionData
 from fusecap.types import Detections, ImuReading
 
 
+@runtime_checkable
 class Instants(Protocol):
     """Recorded measurements on the solve's instants."""
 
@@ -60,34 +61,43 @@ def scene_of(data: SessionData, landmarks: LandmarkSet | None = None) -> Scene:
 
     `landmarks` are the session's own unless given.
     """
-    session = data.session
-    settings = session.settings
-    options = solver_options(session)
     landmarks = landmarks or data.landmarks or LANDMARK_SETS["body25"]
     sites = {
         imus.subject: ImuSites(
-            bone=tuple(session.skeleton.bone(name) for name in imus.bones),
+            bone=tuple(data.session.skeleton.bone(name) for name in imus.bones),
             position_m=np.ascontiguousarray(imus.positions_in_bone_m, dtype=np.float64),
         )
         for imus in data.imus
     }
+    return scene_before(data.session, data.rig, landmarks, sites)
+
+
+def scene_before(
+    session: Session,
+    rig: Rig,
+    landmarks: LandmarkSet,
+    sites: Mapping[str, ImuSites] | None = None,
+) -> Scene:
+    """`scene_of` before measurements are there; `sites` are the subjects' sensors by name."""
+    settings = session.settings
+    sites = sites or {}
     subjects = tuple(
         SubjectModel(
             name=subject.name,
-            shape=_shape(session.skeleton, subject, measurable=len(data.rig) > 1),
+            shape=_shape(session.skeleton, subject, measurable=len(rig) > 1),
             sites=sites.get(subject.name, ImuSites.none()),
             start_m=subject.start_m,
         )
         for subject in session.subjects
     )
     return Scene(
-        rig=data.rig,
+        rig=rig,
         landmarks=landmarks,
         skeleton=session.skeleton,
         rate_hz=settings.rate_hz,
         subjects=subjects,
         sorter=make_sorter(
-            data.rig,
+            rig,
             landmarks,
             subjects,
             associate=settings.associate,
@@ -95,7 +105,7 @@ def scene_of(data: SessionData, landmarks: LandmarkSet | None = None) -> Scene:
             volume_m=settings.volume_m,
         ),
         prior=load_prior(session.skeleton),
-        options=options,
+        options=solver_options(session),
     )
 
 

@@ -15,9 +15,17 @@ from typing import Annotated
 import typer
 
 from fusecap.cli import (
+    calibrate_board,
+    calibrate_extrinsics,
+    calibrate_imu,
+    calibrate_intrinsics,
     calibrate_offsets,
     calibrate_prior,
+    calibrate_shape,
+    calibrate_sync,
+    calibrate_world,
     demo,
+    detect,
     doctor,
     evaluate_datasets,
     evaluate_twin,
@@ -25,6 +33,7 @@ from fusecap.cli import (
     init,
     simulate,
     solve,
+    stream,
 )
 from fusecap.cli.common import err, print_json
 from fusecap.errors import FusecapError
@@ -37,7 +46,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-calibrate = typer.Typer(no_args_is_help=True, help="Calibrations: offsets, prior.")
+calibrate = typer.Typer(no_args_is_help=True, help="Calibrations: cameras, world, clocks, IMUs, bodies, landmark offsets, prior.")
 app.add_typer(calibrate, name="calibrate")
 evaluate = typer.Typer(no_args_is_help=True, help="The paper's tables and figures.")
 app.add_typer(evaluate, name="evaluate")
@@ -59,13 +68,22 @@ def _root(
 
 
 app.command(epilog=demo.EXAMPLE)(demo.demo)
+app.command(epilog=detect.EXAMPLE)(detect.detect)
 app.command(epilog=solve.EXAMPLE)(solve.solve)
 app.command(epilog=export.EXAMPLE)(export.export)
 app.command(epilog=doctor.EXAMPLE)(doctor.doctor)
 app.command(epilog=init.EXAMPLE)(init.init)
 app.command(epilog=simulate.EXAMPLE)(simulate.simulate)
+app.command(epilog=stream.EXAMPLE)(stream.stream)
+calibrate.command(epilog=calibrate_imu.EXAMPLE)(calibrate_imu.imu)
 calibrate.command(epilog=calibrate_offsets.EXAMPLE)(calibrate_offsets.offsets)
 calibrate.command(epilog=calibrate_prior.EXAMPLE)(calibrate_prior.prior)
+calibrate.command(epilog=calibrate_sync.EXAMPLE)(calibrate_sync.sync)
+calibrate.command(epilog=calibrate_board.EXAMPLE)(calibrate_board.board)
+calibrate.command(epilog=calibrate_intrinsics.EXAMPLE)(calibrate_intrinsics.intrinsics)
+calibrate.command(epilog=calibrate_extrinsics.EXAMPLE)(calibrate_extrinsics.extrinsics)
+calibrate.command(epilog=calibrate_shape.EXAMPLE)(calibrate_shape.shape)
+calibrate.command(epilog=calibrate_world.EXAMPLE)(calibrate_world.world)
 evaluate_twin.add_to(evaluate)
 evaluate_datasets.add_to(evaluate)
 

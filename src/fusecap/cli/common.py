@@ -35,21 +35,31 @@ def check_choice(option: str, value: str, known: tuple[str, ...]) -> None:
 
 
 @contextmanager
-def progress(*, quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
-    """A bar with ETA on stderr, one per kind of work; silent with --json."""
+def progress(*, quiet: bool, rate: bool = False) -> Iterator[Callable[[str, int, int], None]]:
+    """A bar with ETA on stderr, one per kind of work; silent with --json.
+
+    With `rate` it also shows how many are done per second.
+    """
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
         Progress,
+        ProgressColumn,
+        Task,
         TextColumn,
         TimeElapsedColumn,
         TimeRemainingColumn,
     )
 
+    class Rate(ProgressColumn):
+        def render(self, task: Task) -> str:
+            return f"{task.speed:.1f}/s" if task.speed else ""
+
     columns = (
         TextColumn("{task.description:<28.28}"),
         BarColumn(),
         MofNCompleteColumn(),
+        *((Rate(),) if rate else ()),
         TimeElapsedColumn(),
         TextColumn("ETA"),
         TimeRemainingColumn(),

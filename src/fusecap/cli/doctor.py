@@ -16,7 +16,7 @@ def doctor(
     """Check a session before it is solved: what is wrong, and what to do about it."""
     from dataclasses import asdict
 
-    from fusecap.sources.doctor import diagnose
+    from fusecap.doctor import diagnose
 
     with progress(quiet=as_json) as show:
         findings = diagnose(session, show)

@@ -41,7 +41,11 @@ def solve(
     picture: Annotated[bool, typer.Option("--picture", help="Also draw the motion.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Solve a recorded session: keypoints and IMU files to each person's motion."""
+    """Solve a recorded session: videos or keypoints, and IMU files, to each person's motion.
+
+    Keypoints of videos are detected first (as `fusecap detect` does) and kept for the next time.
+    """
+    from fusecap.cli.detect import detect_missing, print_detection
     from fusecap.offline.solve import solve_session
     from fusecap.sinks.files import safe_name
     from fusecap.sources.session import load_session
@@ -53,12 +57,19 @@ def solve(
     target = out or loaded.folder / f"{safe_name(loaded.settings.name)}.npz"
     if target.suffix != ".npz":
         raise InputError(f"--out {target}: a take is one .npz file")
+    detected = detect_missing(loaded, quiet=as_json)
+    if detected is not None and not as_json:
+        print_detection(detected)
+    if detected is not None and detected.interrupted:
+        raise KeyboardInterrupt
     with progress(quiet=as_json) as show:
         data = open_session(loaded, show)
         solved = solve_session(data, progress=show)
     files = write_take(solved.take, target, exports=formats, unit=unit, picture=picture)
     if as_json:
-        print_json(solved.report.as_json() | {"files": [str(path) for path in files]})
+        detection = {} if detected is None else {"detection": detected.as_json()}
+        paths = [str(path) for path in files]
+        print_json(solved.report.as_json() | detection | {"files": paths})
     else:
         for note in solved.report.notes:
             err.print(f"[yellow]note[/] {note}", soft_wrap=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -15,6 +15,7 @@ DEFAULT_MODEL = "rtmpose-m-halpe26"
 DEFAULT_PERSON_MODEL = "rtmdet-nano-person"
 
 
+@runtime_checkable
 class Detector(Protocol):
     """Finds everyone in the images of one instant; holds no clock."""
 

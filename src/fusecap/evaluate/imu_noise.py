@@ -131,6 +131,10 @@ class SimulatedImus:
     bone_from_imu: Float[np.ndarray, "i 3 3"]
     """As the calibration believes it."""
     position_in_bone_m: Float[np.ndarray, "i 3"]
+    mounting: Float[np.ndarray, "i 3 3"]
+    """bone_from_imu as it truly is, between bone and sensor at rest."""
+    heading_rad: Float[np.ndarray, "t i"]
+    """How far the sensor's world is truly turned about up against ours, with its drift."""
 
     def subset(self, bones: Sequence[str]) -> SimulatedImus:
         """The sensors on the named bones, in the order they are in."""
@@ -144,6 +148,8 @@ class SimulatedImus:
             gyro_rad_s=self.gyro_rad_s[:, kept],
             bone_from_imu=self.bone_from_imu[kept],
             position_in_bone_m=self.position_in_bone_m[kept],
+            mounting=self.mounting[kept],
+            heading_rad=self.heading_rad[:, kept],
         )
 
     def orientation_wxyz(self, sensor: int) -> Float[np.ndarray, "t 4"]:
@@ -223,6 +229,8 @@ def measure(
         gyro_rad_s=gyro,
         bone_from_imu=_rotation(misalignment) @ mounting,
         position_in_bone_m=at,
+        mounting=mounting,
+        heading_rad=heading[..., 1],
     )
 
 

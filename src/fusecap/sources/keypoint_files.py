@@ -3,7 +3,8 @@
     {"people": [{"pose_keypoints_2d": [x, y, confidence, ...]}, ...]}
 
 The last number of a file's name is its frame. A frame without a file holds nobody. A keypoint at
-(0, 0) or with confidence 0 is missing: NaN, NaN, 0 from here on.
+(0, 0) or with confidence 0 is missing: NaN, NaN, 0 from here on. Folders that fusecap wrote carry
+the frames' own times (`fusecap.sources.detection_files`).
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import numpy as np
 
 from fusecap.body.landmarks import LANDMARK_SETS, LandmarkSet
 from fusecap.errors import InputError
+from fusecap.sources.detection_files import read_record
 
 Progress = Callable[[int, int], None]
 """Called with (done, total)."""
@@ -40,7 +42,7 @@ class KeypointTrack:
     frames: np.ndarray
     """(F,) frame numbers, ascending; a missing number is a frame without people."""
     times_s: np.ndarray
-    """(F,) on the session's clock: frame / rate + offset."""
+    """(F,) on the session's clock: frame / rate, or the video's own time, + offset."""
     people: tuple[np.ndarray, ...]
     """Per frame (n, K, 3): x [px], y [px], confidence 0-1; NaN, NaN, 0 where missing."""
     broken: tuple[str, ...]
@@ -58,10 +60,12 @@ def read_keypoints(
     landmarks: LandmarkSet,
     rate_hz: float,
     offset_s: float = 0.0,
+    own_times: bool = True,
     progress: Progress | None = None,
 ) -> KeypointTrack:
     """All frames of one camera.
 
+    With `own_times` the times and rate that a detection left beside the frames replace `rate_hz`.
     Raises `InputError` for a folder without frames, one whose files are all broken, and keypoints
     of another format; a broken file among good ones counts as a frame without people.
     """
@@ -82,15 +86,31 @@ def read_keypoints(
             f"(first: {broken[0]}); expected OpenPose JSON: run the detector again"
         )
     frames = np.array([number for number, _ in numbered], dtype=np.int64)
+    times_s = frames / rate_hz
+    record = read_record(folder) if own_times else None
+    if record is not None:
+        if frames[-1] >= len(record.times_ns):
+            raise InputError(
+                f"{folder}: frame {frames[-1]} is not in the video that was detected, which has "
+                f"{len(record.times_ns)}; delete the folder and detect again"
+            )
+        times_s, rate_hz = record.frame_times_s(frames), record.video.rate_hz
     return KeypointTrack(
         name=name,
         landmarks=landmarks,
         rate_hz=rate_hz,
         frames=frames,
-        times_s=frames / rate_hz + offset_s,
+        times_s=times_s + offset_s,
         people=tuple(people),
         broken=tuple(broken),
     )
+
+
+def frame_number(name: str) -> int | None:
+    """The frame that a file's name ends in; None for other files."""
+    stem, suffix = os.path.splitext(name)
+    match = _FRAME_NUMBER.search(stem) if suffix == ".json" else None
+    return int(match.group(1)) if match else None
 
 
 def _numbered_files(folder: Path) -> list[tuple[int, str]]:
@@ -99,11 +119,9 @@ def _numbered_files(folder: Path) -> list[tuple[int, str]]:
     by_frame: dict[int, str] = {}
     with os.scandir(folder) as entries:
         for entry in entries:
-            stem, suffix = os.path.splitext(entry.name)
-            match = _FRAME_NUMBER.search(stem) if suffix == ".json" else None
-            if match is None:
+            number = frame_number(entry.name)
+            if number is None:
                 continue
-            number = int(match.group(1))
             if number >= MAX_FRAME:
                 raise InputError(
                     f"{entry.path}: frame {number} is out of range; expected a name that ends in "
@@ -122,6 +140,14 @@ def _numbered_files(folder: Path) -> list[tuple[int, str]]:
             "frame's number"
         )
     return sorted(by_frame.items())
+
+
+def read_people(path: Path, landmarks: LandmarkSet) -> np.ndarray | None:
+    """(n, K, 3) the people of one file; None for one that is truncated, garbled or gone."""
+    try:
+        return _read_frame(str(path), landmarks)
+    except _BrokenFile:
+        return None
 
 
 def _read_frame(path: str, landmarks: LandmarkSet) -> np.ndarray:

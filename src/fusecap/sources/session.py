@@ -6,6 +6,7 @@ the named files exist; it opens none of them (`fusecap.sources.session_data` doe
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -19,6 +20,7 @@ from pydantic import (
     PrivateAttr,
     ValidationError,
     ValidationInfo,
+    field_validator,
     model_validator,
 )
 from pydantic_core import PydanticCustomError
@@ -27,9 +29,12 @@ from fusecap.body.landmarks import LANDMARK_SETS
 from fusecap.body.shape import MAX_HEIGHT_M, MIN_HEIGHT_M
 from fusecap.body.skeleton import Skeleton, skeleton_named
 from fusecap.errors import MotionError, SessionError, nearest
+from fusecap.sources.imu_calibration_files import read_imu_calibration
 
 FILE_NAME = "session.toml"
 KEYPOINT_FORMATS = tuple(f"openpose-{name}" for name in LANDMARK_SETS)
+MODEL_SUFFIXES = (".onnx", ".xml")
+"""Of network files; anything else is a name."""
 IMU_FORMATS = ("csv", "xsens-mt", "xsens-dot", "mvnx", "sto", "apdm-csv", "gaittoolbox-csv")
 
 
@@ -163,6 +168,10 @@ class SessionSettings(_Table):
     """x_min, x_max, z_min, z_max in the y-up world."""
     landmark_offsets: File | None = None
     """Calibrated landmark offsets, as `fusecap calibrate offsets` writes them."""
+    sync: File | None = None
+    """Clocks of cameras and sensors, as `fusecap calibrate sync` writes them."""
+    imu_calibration: File | None = None
+    """How sensors sit on their bones, as `fusecap calibrate imu` writes it."""
     associate: Annotated[str, _one_of(["tracker", "paper"])] = "tracker"
 
     @model_validator(mode="after")
@@ -175,6 +184,24 @@ class SessionSettings(_Table):
                 {"found": str(list(v))},
             )
         return self
+
+
+class DetectorSettings(_Table):
+    """`[detector]`: how keypoints are found in videos; None: the detector's default."""
+
+    model: Name | None = None
+    """A name of the model store, or a file (.onnx, .xml)."""
+    person_model: Name | None = None
+    runtime: Annotated[str, _one_of(["auto", "onnxruntime", "openvino"])] | None = None
+    person_every: Annotated[int, Field(strict=True, ge=1)] | None = None
+    packed: Flag | None = None
+
+    @field_validator("model", "person_model")
+    @classmethod
+    def _from_the_folder(cls, value: str | None, info: ValidationInfo) -> str | None:
+        if value is None or Path(value).suffix.lower() not in MODEL_SUFFIXES:
+            return value
+        return str(_resolved(Path(value), info))
 
 
 class CameraSettings(_Table):
@@ -193,7 +220,8 @@ class CameraSettings(_Table):
     def _has_a_source(self) -> CameraSettings:
         if self.keypoints is None and self.video is None:
             raise PydanticCustomError(
-                "no_source", "neither keypoints nor video is given; name a folder of keypoint files"
+                "no_source",
+                "neither keypoints nor video is given; name a folder of keypoint files or a video",
             )
         return self
 
@@ -266,6 +294,7 @@ class Session(_Table):
     cameras: tuple[CameraSettings, ...] = Field(default=(), alias="camera")
     subjects: tuple[SubjectSettings, ...] = Field(default=(), alias="subject")
     estimator: EstimatorSettings = EstimatorSettings()
+    detector: DetectorSettings = DetectorSettings()
     _path: Path = PrivateAttr(default=Path(FILE_NAME))
 
     def model_post_init(self, context: Any) -> None:
@@ -288,6 +317,10 @@ class Session(_Table):
         """The skeleton that the session asks for."""
         return skeleton_named(self.settings.skeleton)
 
+    def detection_folder(self, camera: CameraSettings) -> Path:
+        """Where keypoints that are detected in a camera's video go."""
+        return self.folder / "keypoints" / re.sub(r"[^\w.-]", "_", camera.name)
+
     def camera_rate_hz(self, camera: CameraSettings) -> float:
         """A camera's frame rate."""
         return camera.rate_hz or self.settings.rate_hz
@@ -300,11 +333,6 @@ class Session(_Table):
         ]
         if not self.cameras and not any(subject.imus for subject in self.subjects):
             problems.append("there is neither a [[camera]] nor a [[subject.imu]]: nothing to solve")
-        if self.cameras and self.settings.calibration is None:
-            problems.append(
-                "[session] calibration is missing; cameras need a calibration file, as "
-                "fusecap calibrate extrinsics writes it"
-            )
         for subject in self.subjects:
             problems += _unknown_bones(self.skeleton, subject)
         if problems:
@@ -338,7 +366,37 @@ def load_session(path: Path | str) -> Session:
     missing = missing_files(session)
     if missing:
         raise SessionError("\n".join(f"{session.path}: {line}" for line in missing))
-    return session
+    return with_imu_calibration(session)
+
+
+def with_imu_calibration(session: Session) -> Session:
+    """The session with the sensors' constants of its `imu_calibration`; raises `SessionError`."""
+    path = session.settings.imu_calibration
+    if path is None:
+        return session
+    found = {(imu.subject, imu.bone): imu for imu in read_imu_calibration(path)}
+    known = {(subject.name, imu.bone) for subject in session.subjects for imu in subject.imus}
+    for subject, bone in found.keys() - known:
+        raise SessionError(
+            f"{path}: holds imu '{bone}' of '{subject}', which {session.path} does not have; "
+            "calibrate this session with: fusecap calibrate imu"
+        )
+    subjects = []
+    for subject in session.subjects:
+        imus = []
+        for imu in subject.imus:
+            own = found.get((subject.name, imu.bone))
+            update = (
+                {}
+                if own is None
+                else {
+                    "bone_from_imu_wxyz": own.bone_from_imu_wxyz,
+                    "heading_deg": own.heading_deg,
+                }
+            )
+            imus.append(imu.model_copy(update=update))
+        subjects.append(subject.model_copy(update={"imus": tuple(imus)}))
+    return session.model_copy(update={"subjects": tuple(subjects)})
 
 
 def parse_session(path: Path | str) -> Session:
@@ -382,6 +440,8 @@ def missing_files(session: Session) -> list[str]:
 
     check("[session] calibration", session.settings.calibration, folder=None)
     check("[session] landmark_offsets", session.settings.landmark_offsets, folder=False)
+    check("[session] imu_calibration", session.settings.imu_calibration, folder=False)
+    check("[session] sync", session.settings.sync, folder=False)
     for camera in session.cameras:
         check(f"[[camera]] '{camera.name}' keypoints", camera.keypoints, folder=True)
         check(f"[[camera]] '{camera.name}' video", camera.video, folder=False)

@@ -20,11 +20,13 @@ from fusecap.body.landmarks import LandmarkSet, landmark_set_named
 from fusecap.errors import SessionError
 from fusecap.geometry.camera import Rig
 from fusecap.sources.calibration_files import check_rig, load_rig
+from fusecap.sources.detection_files import read_record
 from fusecap.sources.findings import Finding
 from fusecap.sources.imu_files import ImuTrack, read_imu
 from fusecap.sources.keypoint_files import KeypointTrack, read_keypoints
 from fusecap.sources.offset_files import read_offsets
-from fusecap.sources.session import ImuSettings, Session, SubjectSettings
+from fusecap.sources.session import CameraSettings, ImuSettings, Session, SubjectSettings
+from fusecap.sources.sync_files import Clocks, read_sync
 from fusecap.sources.synchronizer import (
     MAX_GAP_S,
     MountedImu,
@@ -106,19 +108,29 @@ class SessionData:
 
 
 def open_session(session: Session, progress: Progress | None = None) -> SessionData:
-    """Reads all inputs; raises `InputError` for the first that cannot be used."""
+    """Reads all inputs; raises `InputError` for the first that cannot be used.
+
+    Cameras with a video need keypoints that were detected in it (`with_detections`).
+    """
+    session = with_detections(session)
     rig, findings = open_rig(session)
     landmarks = common_landmarks(session)
-    keypoints = tuple(
-        _keypoints(session, index, landmarks, progress) for index in range(len(session.cameras))
-    )
+    keypoints = open_keypoints(session, progress)
     for track in keypoints:
         if track.broken:
             findings.append(broken_files(track))
+    clocks = session_clocks(session)
+    keypoints = tuple(
+        replace(track, times_s=clocks.camera(track.name).session_s(track.times_s))
+        for track in keypoints
+    )
     findings += unplaced_wearers(session)
     tracks = {}
     for subject in session.subjects:
-        tracks[subject.name] = open_imus(subject)
+        tracks[subject.name] = [
+            replace(track, times_s=clocks.imu(subject.name, imu.bone).session_s(track.times_s))
+            for imu, track in zip(subject.imus, open_imus(subject), strict=True)
+        ]
         for imu, track in zip(subject.imus, tracks[subject.name], strict=True):
             findings += [
                 Finding(
@@ -156,6 +168,33 @@ def open_session(session: Session, progress: Progress | None = None) -> SessionD
     )
 
 
+def with_detections(session: Session) -> Session:
+    """The session with what `fusecap detect` left in its folder.
+
+    A camera that names a video only gets the folder of its keypoints, where these are complete and
+    the video still has the name and size that they were made from. A session that does not state
+    its rate takes that of the first detected video.
+    """
+    cameras = tuple(_with_folder(session, camera) for camera in session.cameras)
+    settings = session.settings
+    if "rate_hz" not in settings.model_fields_set:
+        records = [read_record(c.keypoints) for c in cameras if c.keypoints and not c.rate_hz]
+        rates_hz = [record.video.rate_hz for record in records if record is not None]
+        if rates_hz:
+            settings = settings.model_copy(update={"rate_hz": rates_hz[0]})
+    return session.model_copy(update={"cameras": cameras, "settings": settings})
+
+
+def _with_folder(session: Session, camera: CameraSettings) -> CameraSettings:
+    if camera.keypoints is not None or camera.video is None:
+        return camera
+    folder = session.detection_folder(camera)
+    record = read_record(folder)
+    if record is None or not record.complete or not record.video.is_likely(camera.video):
+        return camera
+    return camera.model_copy(update={"keypoints": folder})
+
+
 def unplaced_wearers(session: Session) -> list[Finding]:
     """People who wear sensors but could be anyone the cameras find first."""
     if not session.cameras or len(session.subjects) < 2:
@@ -173,10 +212,23 @@ def unplaced_wearers(session: Session) -> list[Finding]:
     ]
 
 
+def session_clocks(session: Session) -> Clocks:
+    """Those of the session's `sync` file; of one without, everybody's times are right."""
+    return Clocks() if session.settings.sync is None else read_sync(session.settings.sync)
+
+
 def open_rig(session: Session) -> tuple[Rig, list[Finding]]:
-    """The session's cameras in its order, and what is odd about them."""
-    if not session.cameras or session.settings.calibration is None:
+    """The session's cameras in its order, and what is odd about them.
+
+    Raises `SessionError` for cameras without a calibration.
+    """
+    if not session.cameras:
         return Rig(cameras=()), []
+    if session.settings.calibration is None:
+        raise SessionError(
+            f"{session.path}: [session] calibration is missing; cameras need a calibration file, "
+            "as fusecap calibrate extrinsics writes it"
+        )
     rig = load_rig(
         session.settings.calibration,
         up=session.settings.up,
@@ -190,7 +242,7 @@ def common_landmarks(session: Session) -> LandmarkSet | None:
 
     Raises `SessionError` when cameras differ, `InputError` for offsets that cannot be used.
     """
-    names = {camera.name: camera.landmark_set_name for camera in session.cameras}
+    names = {camera.name: _landmark_set_name(session, camera) for camera in session.cameras}
     if len(set(names.values())) > 1:
         listed = ", ".join(f"'{camera}' openpose-{name}" for camera, name in names.items())
         raise SessionError(
@@ -205,14 +257,35 @@ def common_landmarks(session: Session) -> LandmarkSet | None:
     return landmarks.calibrated(read_offsets(session.settings.landmark_offsets, landmarks.name))
 
 
+def _landmark_set_name(session: Session, camera: CameraSettings) -> str:
+    """The set that a detection left in the camera's folder, else that of its format."""
+    record = read_record(camera.keypoints) if camera.keypoints else None
+    if record is None:
+        return camera.landmark_set_name
+    if "format" in camera.model_fields_set and record.landmark_set != camera.landmark_set_name:
+        raise SessionError(
+            f"{session.path}: camera '{camera.name}' states format = \"{camera.format}\", but "
+            f"{camera.keypoints} holds openpose-{record.landmark_set}; leave format out"
+        )
+    return record.landmark_set
+
+
+def open_keypoints(session: Session, progress: Progress | None = None) -> tuple[KeypointTrack, ...]:
+    """Of all cameras, on their own clocks; raises `InputError`."""
+    landmarks = common_landmarks(session)
+    return tuple(
+        _keypoints(session, index, landmarks, progress) for index in range(len(session.cameras))
+    )
+
+
 def _keypoints(
     session: Session, index: int, landmarks: LandmarkSet | None, progress: Progress | None
 ) -> KeypointTrack:
     camera = session.cameras[index]
     if camera.keypoints is None or landmarks is None:
         raise SessionError(
-            f"{session.path}: camera '{camera.name}' has a video but no keypoints; run a detector "
-            "on the video and name the folder of its JSON files as keypoints"
+            f"{session.path}: camera '{camera.name}' has a video but no keypoints yet; run: "
+            f"fusecap detect {session.folder}"
         )
     report = None if progress is None else partial(progress, f"camera '{camera.name}'")
     return read_keypoints(
@@ -221,6 +294,7 @@ def _keypoints(
         landmarks=landmarks,
         rate_hz=session.camera_rate_hz(camera),
         offset_s=camera.offset_s,
+        own_times=camera.rate_hz is None,
         progress=report,
     )
 
@@ -341,10 +415,13 @@ def solve_times_s(
 def content_hash(session: Session) -> str:
     """sha256 over the session file and, per input, its name, size and (up to 1 MiB) content.
 
-    Of keypoint folders names and sizes only. The same inputs hash alike in every folder.
+    Of keypoint folders names and sizes only, and of detected ones the video and the detector. The
+    same inputs hash alike in every folder.
     """
     digest = hashlib.sha256(session.path.read_bytes() if session.path.is_file() else b"")
     inputs = [session.settings.calibration, session.settings.landmark_offsets]
+    inputs += [session.settings.imu_calibration]
+    inputs += [session.settings.sync] if session.settings.sync is not None else []
     inputs += [imu.file for subject in session.subjects for imu in subject.imus]
     for path in inputs:
         if path is not None and path.is_dir():
@@ -356,6 +433,9 @@ def content_hash(session: Session) -> str:
         if camera.keypoints is not None and camera.keypoints.is_dir():
             for file in sorted(camera.keypoints.glob("*.json")):
                 _add_file(digest, file, with_content=False)
+            record = read_record(camera.keypoints)
+            if record is not None:
+                digest.update(f"{record.video.sha256}\0{record.detector}\0".encode())
     return digest.hexdigest()
 
 

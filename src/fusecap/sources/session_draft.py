@@ -26,7 +26,7 @@ def draft(found: FolderSurvey) -> str:
     elif found.videos or found.keypoints:
         lines += [
             "# fusecap calibrate intrinsics and fusecap calibrate extrinsics write it:",
-            'calibration = "calibration.toml"',
+            '# calibration = "calibration.toml"',
         ]
     return "\n".join([*lines, *_cameras(found), *_subject(found)]) + "\n"
 

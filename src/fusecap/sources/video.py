@@ -227,7 +227,7 @@ def _opened(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
         ]
         if not pictures:
             kinds = ", ".join(sorted({s.type for s in container.streams})) or "nothing"
-            raise InputError(f"{path}: no video in this file, only {kinds}; expected a video")
+            raise InputError(f"{path}: no video in this file, found {kinds}; expected a video")
         yield container, pictures[0]
 
 

@@ -2,5 +2,6 @@
 
 from fusecap.sources.calibration_files.loader import load_rig
 from fusecap.sources.calibration_files.plausibility import check_rig
+from fusecap.sources.calibration_files.writer import write_rig
 
-__all__ = ["check_rig", "load_rig"]
+__all__ = ["check_rig", "load_rig", "write_rig"]

@@ -9,13 +9,23 @@
     translation = [x, y, z]            # point_in_cam = rotation @ point_in_world + translation
 
 Newer caliscope files nest the tables under `[cameras]`. A table without `matrix` is no camera.
+
+What is written: metres, Rodrigues rotations, five coefficients, every number of an array a float.
+`CameraGroup.load` of aniposelib (and of FreeMoCap, which carries it) needs exactly the keys above
+and takes tables in alphabetical order, so their numbers have as many digits as the last one's;
+`retrieve_calib_params` of Pose2Sim takes every table but `[metadata]` for a camera;
+`load_camera_array` of caliscope reads only tables under `[cameras]`, by number.
 """
 
 from __future__ import annotations
 
+import json
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+from scipy.spatial.transform import Rotation
 
 from fusecap.errors import CalibrationError
 from fusecap.geometry.camera import Camera
@@ -37,6 +47,35 @@ def read(path: Path) -> list[Camera]:
         if isinstance(value, dict) and "matrix" in value and value.get("ignore") is not True
     }
     return [_camera(path, key, table) for key, table in tables.items()]
+
+
+def dumps(cameras: Sequence[Camera], *, notes: Sequence[str] = (), nested: bool = False) -> str:
+    """The text of a file with these cameras, translations in metres.
+
+    `notes` become comments at its head. `nested` writes caliscope's `[cameras.N]`.
+    """
+    digits = len(str(max(len(cameras) - 1, 0)))
+    head = [
+        *(f"# {line}" for note in notes for line in note.splitlines()),
+        "# point_in_cam = rotation @ point_in_world + translation; rotation: Rodrigues vector in",
+        "# radians; translation in metres; matrix in pixels; distortions k1, k2, p1, p2, k3.",
+    ]
+    tables = ["\n".join(head) + "\n"]
+    for index, camera in enumerate(cameras):
+        key = f"cameras.{index}" if nested else f"cam_{index:0{digits}d}"
+        tables.append(
+            f"[{key}]\n"
+            + (f"cam_id = {index}\n" if nested else "")
+            + f"name = {json.dumps(camera.name, ensure_ascii=False)}\n"
+            f"size = {list(camera.size_px)}\n"
+            f"matrix = {camera.matrix.tolist()}\n"
+            f"distortions = {camera.distortion.tolist()}\n"
+            f"rotation = {Rotation.from_matrix(camera.rotation).as_rotvec().tolist()}\n"
+            f"translation = {camera.translation.tolist()}\n"
+        )
+    if not nested:
+        tables.append('[metadata]\nadjusted = false\nunits = "metres"\n')
+    return "\n".join(tables)
 
 
 def _camera(path: Path, key: str, table: dict[str, Any]) -> Camera:

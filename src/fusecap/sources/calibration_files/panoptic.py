@@ -2,11 +2,14 @@
 
     point_in_cam = R point_in_world + t, in centimetres; distCoef in OpenCV's order
 
-Its world's up axis is -y: say `up = "-y"` in the session.
+Its world's up axis is -y: say `up = "-y"` in the session. What is written keeps the world of the
+cameras, which is y up here.
 """
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,3 +42,23 @@ def read(path: Path, data: dict[str, Any]) -> list[Camera]:
             )
         )
     return cameras
+
+
+def dumps(cameras: Sequence[Camera]) -> str:
+    """The text of a file with these cameras, translations in centimetres."""
+    entries = [
+        {
+            "name": camera.name,
+            "type": "hd",
+            "resolution": list(camera.size_px),
+            "panel": 0,
+            "node": index,
+            "K": camera.matrix.tolist(),
+            "distCoef": camera.distortion.tolist(),
+            "R": camera.rotation.tolist(),
+            "t": (camera.translation / METRES_PER_CENTIMETRE)[:, None].tolist(),
+        }
+        for index, camera in enumerate(cameras)
+    ]
+    document = {"units": "t in centimetres, K in pixels", "cameras": entries}
+    return json.dumps(document, indent=1, ensure_ascii=False) + "\n"

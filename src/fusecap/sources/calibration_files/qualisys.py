@@ -8,6 +8,7 @@ fx, fy, cx, cy = value / 64                   its pixels are cut into 64ths
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -19,6 +20,7 @@ from fusecap.sources import safe_xml
 from fusecap.sources.calibration_files import fields
 
 SUBPIXELS = 64.0
+_FLIP = np.diag([1.0, -1.0, -1.0])
 
 
 def read(path: Path) -> list[Camera]:
@@ -32,6 +34,51 @@ def read(path: Path) -> list[Camera]:
         for element in root.iterfind("./cameras/camera")
         if element.get("active", "1") == "1"
     ]
+
+
+def dumps(cameras: Sequence[Camera]) -> str:
+    """The text of a file with these cameras, positions in millimetres."""
+    root = ElementTree.Element("calibration", {"type": "regular", "source": "fusecap"})
+    root.append(ElementTree.Comment(" positions in mm; focal lengths and centres in 1/64 px "))
+    group = ElementTree.SubElement(root, "cameras")
+    for camera in cameras:
+        width, height = camera.size_px
+        element = ElementTree.SubElement(
+            group,
+            "camera",
+            {"active": "1", "model": "none", "serial": camera.name, "viewrotation": "0"},
+        )
+        view = {"left": "0", "top": "0", "right": str(width - 1), "bottom": str(height - 1)}
+        for tag in ("fov_marker", "fov_marker_max", "fov_video", "fov_video_max"):
+            ElementTree.SubElement(element, tag, view)
+        in_file, centre_mm = _FLIP @ camera.rotation, camera.position_in_world * 1000.0
+        transform = {f"r{r + 1}{c + 1}": in_file[r, c] for r in range(3) for c in range(3)}
+        transform |= dict(zip("xyz", centre_mm, strict=True))
+        ElementTree.SubElement(element, "transform", _texts(transform))
+        k1, k2, p1, p2, k3 = camera.distortion
+        intrinsic = {
+            "focalLengthU": camera.matrix[0, 0] * SUBPIXELS,
+            "focalLengthV": camera.matrix[1, 1] * SUBPIXELS,
+            "centerPointU": camera.matrix[0, 2] * SUBPIXELS,
+            "centerPointV": camera.matrix[1, 2] * SUBPIXELS,
+            "skew": 0.0,
+            "sensorMinU": 0.0,
+            "sensorMaxU": width * SUBPIXELS,
+            "sensorMinV": 0.0,
+            "sensorMaxV": height * SUBPIXELS,
+            "radialDistortion1": k1,
+            "radialDistortion2": k2,
+            "radialDistortion3": k3,
+            "tangentalDistortion1": p1,
+            "tangentalDistortion2": p2,
+        }
+        ElementTree.SubElement(element, "intrinsic", _texts(intrinsic))
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode", xml_declaration=False) + "\n"
+
+
+def _texts(numbers: dict[str, float]) -> dict[str, str]:
+    return {name: repr(float(value)) for name, value in numbers.items()}
 
 
 def _camera(path: Path, element: ElementTree.Element) -> Camera:
@@ -55,7 +102,7 @@ def _camera(path: Path, element: ElementTree.Element) -> Camera:
     in_file = np.array(
         [[value(transform, f"r{row}{column}") for column in (1, 2, 3)] for row in (1, 2, 3)]
     )
-    rotation = np.diag([1.0, -1.0, -1.0]) @ in_file
+    rotation = _FLIP @ in_file
     centre_m = np.array([value(transform, axis) for axis in "xyz"]) / 1000.0
     matrix = np.eye(3)
     matrix[0, 0] = value(intrinsic, "focalLengthU") / SUBPIXELS

@@ -7,7 +7,10 @@ The file's stem is the camera's name; `point_in_cam = RT @ [point_in_world, 1]`.
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+
+import numpy as np
 
 from fusecap.errors import CalibrationError
 from fusecap.geometry.camera import Camera
@@ -34,4 +37,22 @@ def _camera(path: Path) -> Camera:
         distortion=fields.distortion(data.get("distCoeff"), f"{path}: distCoeff"),
         rotation=pose[:, :3],
         translation=pose[:, 3],
+    )
+
+
+def dumps(camera: Camera) -> str:
+    """The text of one camera's file, its translation in metres."""
+    pose = np.column_stack([camera.rotation, camera.translation])
+    return (
+        json.dumps(
+            {
+                "units": "RT in metres, K in pixels",
+                "K": camera.matrix.ravel().tolist(),
+                "RT": pose.ravel().tolist(),
+                "imgSize": list(camera.size_px),
+                "distCoeff": camera.distortion.tolist(),
+            },
+            indent=1,
+        )
+        + "\n"
     )

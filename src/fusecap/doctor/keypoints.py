@@ -29,10 +29,6 @@ def check_keypoints(
         where = f"camera '{camera.name}'"
         if progress is not None:
             progress(where, done, len(session.cameras))
-        if camera.keypoints is None:
-            findings.add(
-                "error", where, "has a video but no keypoints", "run a detector on the video"
-            )
         if camera.keypoints is None or landmarks is None or not camera.keypoints.is_dir():
             continue
         try:
@@ -42,6 +38,7 @@ def check_keypoints(
                 landmarks=landmarks,
                 rate_hz=session.camera_rate_hz(camera),
                 offset_s=camera.offset_s,
+                own_times=camera.rate_hz is None,
             )
         except FusecapError as error:
             findings.add("error", where, str(error))

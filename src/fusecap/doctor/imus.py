@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -11,11 +13,14 @@ from fusecap.sources.imu_files import read_imu
 from fusecap.sources.imu_files.track import GRAVITY_M_S2, ImuTrack
 from fusecap.sources.session import ImuSettings, Session
 from fusecap.sources.session_data import mount
+from fusecap.sources.sync_files import Clocks
 
 
-def check_imus(session: Session, findings: Findings) -> list[ImuTrack | None]:
+def check_imus(session: Session, clocks: Clocks, findings: Findings) -> list[ImuTrack | None]:
+    """Per sensor its track on the session's clock, None where it cannot be read."""
     tracks: list[ImuTrack | None] = []
     for subject in session.subjects:
+        unmounted = []
         for imu in subject.imus:
             where = f"imu '{imu.bone}' of '{subject.name}'"
             track = None
@@ -24,13 +29,30 @@ def check_imus(session: Session, findings: Findings) -> list[ImuTrack | None]:
                     track = read_imu(
                         imu.file, format=imu.format, sensor=imu.sensor, rate_hz=imu.rate_hz
                     )
-                    mount(subject.model_copy(update={"imus": (imu,)}), [track])
+                    if imu.bone_from_imu_wxyz is None and subject.tpose_s is None:
+                        unmounted.append(imu.bone)
+                    else:
+                        mount(subject.model_copy(update={"imus": (imu,)}), [track])
                 except FusecapError as error:
-                    findings.add("error", where, str(error))
+                    findings.add("error", where, str(error).removeprefix(f"{where}: "))
             if track is not None:
                 _check_imu(where, imu, track, findings)
+                times_s = clocks.imu(subject.name, imu.bone).session_s(track.times_s)
+                track = replace(track, times_s=times_s)
             tracks.append(track)
+        if unmounted:
+            _add_unmounted(subject.name, unmounted, bool(session.cameras), findings)
     return tracks
+
+
+def _add_unmounted(subject: str, bones: list[str], cameras: bool, findings: Findings) -> None:
+    command = "fusecap calibrate imu finds it from motion the cameras saw, or " if cameras else ""
+    findings.add(
+        "error",
+        f"sensors of '{subject}'",
+        f"how they sit on the bones is not known: {', '.join(bones)}",
+        f"{command}state tpose_s = [start, end], when the subject stands in the T-pose",
+    )
 
 
 def _check_imu(where: str, imu: ImuSettings, track: ImuTrack, findings: Findings) -> None:

@@ -2,18 +2,35 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+from fusecap.doctor.detection import check_detection
+from fusecap.doctor.folder import PRINT_A_BOARD, check_folder
+from fusecap.doctor.imus import check_imus
+from fusecap.doctor.keypoints import check_keypoints
+from fusecap.doctor.views import check_views
 from fusecap.errors import FusecapError
 from fusecap.geometry.camera import Rig
-from fusecap.sources.doctor.folder import check_folder
-from fusecap.sources.doctor.imus import check_imus
-from fusecap.sources.doctor.keypoints import check_keypoints
-from fusecap.sources.doctor.views import check_views
 from fusecap.sources.findings import Finding, Findings, Severity
 from fusecap.sources.keypoint_files import KeypointTrack
-from fusecap.sources.session import FILE_NAME, Session, missing_files, parse_session, session_file
-from fusecap.sources.session_data import Progress, open_rig, solve_times_s, unplaced_wearers
+from fusecap.sources.session import (
+    FILE_NAME,
+    Session,
+    missing_files,
+    parse_session,
+    session_file,
+    with_imu_calibration,
+)
+from fusecap.sources.session_data import (
+    Progress,
+    open_rig,
+    session_clocks,
+    solve_times_s,
+    unplaced_wearers,
+    with_detections,
+)
+from fusecap.sources.sync_files import Clocks
 
 
 def diagnose(path: Path | str, progress: Progress | None = None) -> list[Finding]:
@@ -23,16 +40,22 @@ def diagnose(path: Path | str, progress: Progress | None = None) -> list[Finding
         check_folder(Path(path), findings)
         return _sorted(findings)
     try:
-        session = parse_session(path)
+        session = with_detections(parse_session(path))
     except FusecapError as error:
         for line in str(error).splitlines():
             findings.add("error", *_split(line))
         return findings
     for line in missing_files(session):
         findings.add("error", *_split(line))
+    session, clocks = _calibrated(session, findings)
     rig = _check_rig(session, findings)
+    check_detection(session, findings)
     tracks = check_keypoints(session, rig, findings, progress)
-    imus = check_imus(session, findings)
+    tracks = {
+        name: replace(track, times_s=clocks.camera(name).session_s(track.times_s))
+        for name, track in tracks.items()
+    }
+    imus = check_imus(session, clocks, findings)
     _check_amount(session, tracks, findings)
     findings += unplaced_wearers(session)
     complete = len(tracks) == len(session.cameras) and all(
@@ -47,6 +70,23 @@ def diagnose(path: Path | str, progress: Progress | None = None) -> list[Finding
     return _sorted(findings)
 
 
+def _calibrated(session: Session, findings: Findings) -> tuple[Session, Clocks]:
+    """The session with its sensors' calibration, and its clocks, where their files are right."""
+    clocks = Clocks()
+    settings = session.settings
+    if settings.sync is not None and settings.sync.is_file():
+        try:
+            clocks = session_clocks(session)
+        except FusecapError as error:
+            findings.add("error", "clocks", str(error), "fusecap calibrate sync writes it anew")
+    if settings.imu_calibration is not None and settings.imu_calibration.is_file():
+        try:
+            session = with_imu_calibration(session)
+        except FusecapError as error:
+            findings.add("error", "sensors", str(error))
+    return session, clocks
+
+
 def _sorted(findings: Findings) -> list[Finding]:
     order: dict[Severity, int] = {"error": 0, "warning": 1, "info": 2}
     return sorted(findings, key=lambda finding: order[finding.severity])
@@ -59,7 +99,10 @@ def _split(line: str) -> tuple[str, str]:
 
 def _check_rig(session: Session, findings: Findings) -> Rig | None:
     calibration = session.settings.calibration
-    if calibration is None or not calibration.exists():
+    if not session.cameras or (calibration is not None and not calibration.exists()):
+        return None
+    if calibration is None:
+        findings.add("error", "calibration", "is missing under [session]", PRINT_A_BOARD)
         return None
     try:
         rig, odd = open_rig(session)

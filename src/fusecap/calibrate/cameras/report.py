@@ -1,0 +1,387 @@
+"""What speaks for a calibration of several cameras, and a picture of it."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from fusecap.calibrate.cameras import extrinsics
+from fusecap.calibrate.cameras.board import Board
+from fusecap.calibrate.cameras.board_views import CameraShots
+from fusecap.calibrate.cameras.extrinsics import HeldOut, Repeatability, ScaleCheck, Solution
+from fusecap.calibrate.cameras.intrinsics import Intrinsics, coverage_cells
+from fusecap.errors import CalibrationError
+from fusecap.geometry.camera import REFERENCE_WIDTH_PX, Camera
+from fusecap.sinks.files import written_whole
+
+GOOD_PX, POOR_PX = 1.0, 3.0
+"""Median held-out error of a corner, in pixels of a 1920-pixel-wide image."""
+GOOD_SCALE, POOR_SCALE = 0.005, 0.02
+"""Mean triangulated edge of a square: how far from the stated one, as a share."""
+GOOD_CENTRE, POOR_CENTRE = 0.003, 0.015
+"""Spread of a camera's centre over resampled instants, as a share of the rig's size."""
+GOOD_COVERAGE = 0.3
+"""Of the cells of each image."""
+ENOUGH_INSTANTS, FEW_INSTANTS = 15, 5
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraReport:
+    """One camera of a rig."""
+
+    name: str
+    views: int
+    """Images that show the board while another camera sees it."""
+    held_out_px: float
+    """Root mean square; the board's pose fitted to all views of the instant."""
+    held_out_median_px: float
+    predicted_median_px: float
+    """The board's pose fitted to the other cameras' views."""
+    coverage: float
+    """Share of the image's cells that hold a corner."""
+    centre_spread_mm: float
+    rotation_spread_deg: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewReport:
+    """One image."""
+
+    camera: str
+    label: str
+    instant: int
+    held_out_px: float
+    """Root mean square; NaN where it could not be held out."""
+    left_out: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class RigReport:
+    """A calibration of several cameras and what speaks for it."""
+
+    cameras: tuple[CameraReport, ...]
+    views: tuple[ViewReport, ...]
+    instants: int
+    """At which two cameras or more see the board."""
+    shared: dict[str, int]
+    """Instants per pair of cameras."""
+    held_out_px: float
+    held_out_median_px: float
+    predicted_median_px: float
+    scale: ScaleCheck
+    resamples: int
+    rig_size_m: float
+    """The largest distance between two cameras."""
+    verdict: str
+    advice: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RigCalibration:
+    """Everything `calibrate extrinsics` has."""
+
+    solution: Solution
+    held_out: tuple[HeldOut, ...]
+    report: RigReport
+
+
+def calibrate_rig(
+    cameras: Sequence[Camera],
+    found: Sequence[CameraShots],
+    board: Board,
+    *,
+    refine_intrinsics: bool = False,
+    seed: int = 0,
+    progress: Progress = lambda what, done, total: None,
+) -> RigCalibration:
+    """Solves the rig and measures it; raises `CalibrationError` where it cannot be solved.
+
+    `cameras` hold the intrinsics, in the order of `found`; the first becomes the world.
+    """
+    if board.ambiguous:
+        raise CalibrationError(
+            f"a {board.words} looks the same after half a turn, so cameras that see it from "
+            "different sides disagree on its first corner; use a charuco board, or a checkerboard "
+            "with an even and an odd number of squares"
+        )
+    for camera, shots in zip(cameras, found, strict=True):
+        if camera.size_px != shots.size_px:
+            raise CalibrationError(
+                f"camera '{camera.name}': its intrinsics are for {camera.size_px[0]} x "
+                f"{camera.size_px[1]} px, {shots.source} is {shots.size_px[0]} x "
+                f"{shots.size_px[1]}; calibrate the lens in the mode that records"
+            )
+    views = extrinsics.views_of(found)
+    progress("all cameras at once", 0, 1)
+    solution = extrinsics.solve(cameras, views, board, refine_intrinsics=refine_intrinsics)
+    progress("all cameras at once", 1, 1)
+    held_out, scale = extrinsics.held_out(
+        cameras, views, board, refine_intrinsics=refine_intrinsics, progress=progress
+    )
+    repeated = extrinsics.repeatability(
+        solution,
+        views,
+        board,
+        refine_intrinsics=refine_intrinsics,
+        seed=seed,
+        progress=progress,
+    )
+    return RigCalibration(
+        solution=solution,
+        held_out=tuple(held_out),
+        report=_report(solution, found, held_out, scale, repeated),
+    )
+
+
+def _report(
+    solution: Solution,
+    found: Sequence[CameraShots],
+    held_out: Sequence[HeldOut],
+    scale: ScaleCheck,
+    repeated: Repeatability,
+) -> RigReport:
+    by_view = {(view.camera, view.instant): view for view in held_out}
+    left_out = set(solution.left_out)
+    instants = set(solution.boards)
+    cameras, views = [], []
+    for index, (camera, shots) in enumerate(zip(solution.cameras, found, strict=True)):
+        mine = [view for view in held_out if view.camera == index]
+        used = [shot for shot in shots.shots if shot.instant in instants]
+        cells = coverage_cells([shot.view for shot in used], shots.size_px)
+        cameras.append(
+            CameraReport(
+                name=camera.name,
+                views=len(used),
+                held_out_px=_rms([view.fitted_px for view in mine]),
+                held_out_median_px=_median([view.fitted_px for view in mine]),
+                predicted_median_px=_median([view.predicted_px for view in mine]),
+                coverage=float((cells > 0).mean()),
+                centre_spread_mm=repeated.centre_mm[index],
+                rotation_spread_deg=repeated.rotation_deg[index],
+            )
+        )
+        for shot in used:
+            view = by_view.get((index, shot.instant))
+            views.append(
+                ViewReport(
+                    camera=camera.name,
+                    label=shot.label,
+                    instant=shot.instant,
+                    held_out_px=np.nan if view is None else _rms([view.fitted_px]),
+                    left_out=(index, shot.instant) in left_out,
+                )
+            )
+    centres = np.array([camera.position_in_world for camera in solution.cameras])
+    size = float(np.linalg.norm(centres[:, None] - centres[None], axis=2).max())
+    seen = {
+        (a.name, b.name): len({s.instant for s in a.shots} & {s.instant for s in b.shots})
+        for i, a in enumerate(found)
+        for b in found[i + 1 :]
+    }
+    scaled = [view.fitted_px * solution.cameras[view.camera].pixel_scale for view in held_out]
+    verdict, advice = _verdict(
+        error_px=_median(scaled), scale=scale, cameras=cameras, size_m=size, instants=len(instants)
+    )
+    return RigReport(
+        cameras=tuple(cameras),
+        views=tuple(views),
+        instants=len(instants),
+        shared={f"{a}, {b}": count for (a, b), count in seen.items()},
+        held_out_px=_rms([view.fitted_px for view in held_out]),
+        held_out_median_px=_median([view.fitted_px for view in held_out]),
+        predicted_median_px=_median([view.predicted_px for view in held_out]),
+        scale=scale,
+        resamples=repeated.resamples,
+        rig_size_m=size,
+        verdict=verdict,
+        advice=advice,
+    )
+
+
+def _verdict(
+    *,
+    error_px: float,
+    scale: ScaleCheck,
+    cameras: Sequence[CameraReport],
+    size_m: float,
+    instants: int,
+) -> tuple[str, tuple[str, ...]]:
+    """The worst of all marks; what could not be measured counts as poor."""
+    marks, advice = [0], []
+
+    def mark(value: float | int, good: float | int, poor: float | int, remedy: str) -> None:
+        level = 0 if value <= good else 1 if value <= poor else 2
+        marks.append(level)
+        if level:
+            advice.append(remedy)
+
+    mark(
+        -instants,
+        -ENOUGH_INSTANTS,
+        -FEW_INSTANTS,
+        f"{instants} instants with the board in two cameras are few: record {ENOUGH_INSTANTS} or "
+        "more, all over the volume",
+    )
+    worst = max(cameras, key=lambda c: np.nan_to_num(c.held_out_median_px, nan=np.inf))
+    mark(
+        error_px,
+        GOOD_PX,
+        POOR_PX,
+        f"held-out corners miss by {error_px:.1f} px of a {REFERENCE_WIDTH_PX:.0f}-px-wide image "
+        f"in the median, most in '{worst.name}': move the board slowly or hold it still, check "
+        "that cameras are in step and that intrinsics belong to them",
+    )
+    least = min(cameras, key=lambda c: c.coverage)
+    mark(
+        1 - least.coverage,
+        1 - GOOD_COVERAGE,
+        1.0,
+        f"the board covered {100 * least.coverage:.0f} % of the image of '{least.name}': carry it "
+        "through the whole volume",
+    )
+    off = abs(scale.mean - 1.0)
+    mark(
+        off,
+        GOOD_SCALE,
+        POOR_SCALE,
+        f"triangulated squares measure {100 * scale.mean:.1f} % of the stated size: measure the "
+        "print, check the intrinsics",
+    )
+    spread = max(cameras, key=lambda c: np.nan_to_num(c.centre_spread_mm, nan=np.inf))
+    mark(
+        1e-3 * spread.centre_spread_mm / max(size_m, 1e-9),
+        GOOD_CENTRE,
+        POOR_CENTRE,
+        f"'{spread.name}' moves by {spread.centre_spread_mm:.0f} mm with the choice of instants: "
+        "record more boards that it shares with the others, closer to the cameras and tilted",
+    )
+    return ("good", "usable", "poor")[max(marks)], tuple(advice)
+
+
+def plot_rig(calibration: RigCalibration, found: Sequence[CameraShots], path: Path) -> None:
+    """Corners of every camera, coloured by their held-out error, and the rig; a PNG."""
+    solution = calibration.solution
+    columns = min(4, len(found))
+    rows = -(-len(found) // columns)
+    figure = Figure(figsize=(4.4 * columns, 3.2 * rows + 4.2), layout="constrained")
+    grid = figure.add_gridspec(rows + 1, columns, height_ratios=[3.2] * rows + [4.2])
+    miss = {(view.camera, view.instant): view.fitted_px for view in calibration.held_out}
+    every = np.concatenate([np.zeros(1), *miss.values()])
+    top = max(1.0, float(np.percentile(every, 95)))
+    for index, shots in enumerate(found):
+        ax = figure.add_subplot(grid[index // columns, index % columns])
+        pixels, error = [np.zeros((0, 2))], [np.zeros(0)]
+        for shot in shots.shots:
+            if (index, shot.instant) in miss:
+                pixels.append(shot.view.pixels)
+                error.append(miss[index, shot.instant])
+        seen = _draw_image(ax, shots.size_px, np.concatenate(pixels), np.concatenate(error), top)
+        row = calibration.report.cameras[index]
+        ax.set_title(f"{shots.name}: {row.held_out_median_px:.2f} px median", fontsize=9)
+        if index == len(found) - 1:
+            figure.colorbar(seen, ax=ax, label="held-out error [px]")
+    ax = figure.add_subplot(grid[rows, :])
+    _draw_rig(ax, solution)
+    _save(figure, path)
+
+
+def plot_lenses(lenses: Sequence[Intrinsics], found: Sequence[CameraShots], path: Path) -> None:
+    """Where each camera saw corners, coloured by their image's held-out error; a PNG."""
+    columns = min(4, len(found))
+    rows = -(-len(found) // columns)
+    figure = Figure(figsize=(4.4 * columns, 3.4 * rows), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False)
+    for ax in axes.ravel()[len(found) :]:
+        ax.set_axis_off()
+    top = max([1.0, *(2 * lens.held_out_px for lens in lenses)])
+    for ax, lens, shots in zip(axes.ravel(), lenses, found, strict=False):
+        by_label = {image.label: image for image in lens.images}
+        used = [shot for shot in shots.shots if shot.label in by_label]
+        error = [np.full(len(s.view), by_label[s.label].held_out_px) for s in used]
+        seen = _draw_image(
+            ax,
+            shots.size_px,
+            np.concatenate([np.zeros((0, 2)), *(s.view.pixels for s in used)]),
+            np.concatenate([np.zeros(0), *error]),
+            top,
+        )
+        ax.set_title(
+            f"{shots.name}: {lens.held_out_px:.2f} px held out, "
+            f"{100 * lens.coverage:.0f} % covered, {lens.verdict}",
+            fontsize=9,
+        )
+        figure.colorbar(seen, ax=ax, label="error of the image [px]")
+    _save(figure, path)
+
+
+def _draw_image(
+    ax: Axes,
+    size_px: tuple[int, int],
+    pixels: Float[np.ndarray, "n 2"],
+    error: Float[np.ndarray, " n"],
+    top: float,
+):
+    width, height = size_px
+    seen = ax.scatter(pixels[:, 0], pixels[:, 1], c=error, s=5, cmap="viridis", vmin=0.0, vmax=top)
+    ax.set_xlim(0, width)
+    ax.set_ylim(height, 0)
+    ax.set_aspect("equal")
+    ax.set_xticks(np.linspace(0, width, 9), minor=True)
+    ax.set_yticks(np.linspace(0, height, 7), minor=True)
+    ax.set_xticks([0, width])
+    ax.set_yticks([0, height])
+    ax.grid(which="minor", alpha=0.3)
+    return seen
+
+
+def _draw_rig(ax: Axes, solution: Solution) -> None:
+    """In the plane of the cameras' widest spread."""
+    centres = np.array([camera.position_in_world for camera in solution.cameras])
+    boards = np.array([pose[:3, 3] for pose in solution.boards.values()])
+    middle = centres.mean(axis=0)
+    _, _, axes = np.linalg.svd(np.vstack([centres, boards]) - middle, full_matrices=False)
+    flat = (centres - middle) @ axes[:2].T
+    there = (boards - middle) @ axes[:2].T
+    ax.scatter(there[:, 0], there[:, 1], s=6, color="0.6", label="boards")
+    ax.scatter(flat[:, 0], flat[:, 1], s=40, color="C3", marker="s", label="cameras")
+    for camera, place in zip(solution.cameras, flat, strict=True):
+        ahead = 0.3 * axes[:2] @ camera.rotation[2]
+        ax.annotate(
+            "",
+            xy=(place[0] + ahead[0], place[1] + ahead[1]),
+            xytext=(place[0], place[1]),
+            arrowprops={"arrowstyle": "->", "color": "C3"},
+        )
+        ax.annotate(camera.name, (place[0], place[1]), xytext=(5, 5), textcoords="offset points")
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.set_title("the rig, seen along the direction in which it is thinnest", fontsize=9)
+    ax.set_xlabel("[m]")
+    ax.set_ylabel("[m]")
+    ax.grid(alpha=0.3)
+    ax.legend(fontsize=8)
+
+
+def _save(figure: Figure, path: Path) -> None:
+    png = io.BytesIO()
+    figure.savefig(png, dpi=90, format="png")
+    with written_whole(path) as file:
+        file.write(png.getvalue())
+
+
+def _rms(errors: Sequence[np.ndarray]) -> float:
+    every = np.concatenate([np.zeros(0), *errors])
+    return float(np.sqrt(np.nanmean(every**2))) if np.isfinite(every).any() else np.nan
+
+
+def _median(errors: Sequence[np.ndarray | None]) -> float:
+    every = np.concatenate([np.zeros(0), *(e for e in errors if e is not None)])
+    return float(np.nanmedian(every)) if np.isfinite(every).any() else np.nan

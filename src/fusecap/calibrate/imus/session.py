@@ -1,0 +1,133 @@
+"""A session's sensors, calibrated from its own cameras, from a take, or from a T-pose."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from fusecap.body.landmarks import LANDMARK_SETS
+from fusecap.calibrate.imus.identify import Identity
+from fusecap.calibrate.imus.motion import (
+    SubjectCalibration,
+    Worn,
+    calibrate_subject,
+    identify_subject,
+)
+from fusecap.calibrate.imus.reference import ReferenceMotion, reference_motion
+from fusecap.calibrate.imus.tpose import TPose, look_at_tpose
+from fusecap.errors import InputError
+from fusecap.offline.solve import Progress, solve_session
+from fusecap.sinks.take import Take
+from fusecap.sources.imu_calibration_files import CalibratedImu
+from fusecap.sources.session import Session, SubjectSettings
+from fusecap.sources.session_data import open_imus, open_session
+
+
+def wearers(session: Session) -> list[SubjectSettings]:
+    """Subjects with sensors; raises `InputError` where there are none."""
+    found = [subject for subject in session.subjects if subject.imus]
+    if not found:
+        raise InputError(
+            f"{session.path}: no [[subject.imu]]; there is nothing to calibrate. Add one table per "
+            "sensor with its bone and file"
+        )
+    return found
+
+
+def seen_by_cameras(session: Session, progress: Progress | None = None) -> Take:
+    """The session solved from its cameras alone; raises `InputError` where it has none."""
+    if not session.cameras:
+        raise InputError(
+            f"{session.path}: there are no cameras to see how the sensors move; give a take of the "
+            "same motion (--take), or stand in a T-pose and use --from tpose"
+        )
+    bare = tuple(subject.model_copy(update={"imus": ()}) for subject in session.subjects)
+    data = open_session(session.model_copy(update={"subjects": bare}), progress)
+    solved = solve_session(data, progress=progress)
+    if solved.report.interrupted:
+        raise KeyboardInterrupt
+    return solved.take
+
+
+def references(
+    session: Session, take: Take, *, optical: bool = False
+) -> dict[str, ReferenceMotion]:
+    """What the take says about each subject with sensors; `optical` takes observe every axis."""
+    landmarks = None
+    if not optical:
+        named = session.cameras[0].landmark_set_name if session.cameras else "body25"
+        landmarks = LANDMARK_SETS[named]
+    return {
+        subject.name: reference_motion(take, take.subject(subject.name), landmarks)
+        for subject in wearers(session)
+    }
+
+
+def calibrate_from_motion(
+    session: Session, reference: dict[str, ReferenceMotion]
+) -> tuple[SubjectCalibration, ...]:
+    """Every subject with sensors; a T-pose that the session states helps where it is sound."""
+    return tuple(
+        calibrate_subject(reference[subject.name], worn_by(subject)) for subject in wearers(session)
+    )
+
+
+def identify_sensors(
+    session: Session, reference: dict[str, ReferenceMotion]
+) -> dict[str, tuple[Identity, ...]]:
+    """By subject, which of its sensors is on which bone."""
+    return {
+        subject.name: identify_subject(reference[subject.name], worn_by(subject))
+        for subject in wearers(session)
+    }
+
+
+def worn_by(subject: SubjectSettings) -> list[Worn]:
+    """The subject's sensors with their samples and, where stated, their T-pose."""
+    worn = []
+    for settings, track in zip(subject.imus, open_imus(subject), strict=True):
+        tpose = None
+        if subject.tpose_s is not None:
+            start_s, end_s = subject.tpose_s
+            if ((track.times_s >= start_s) & (track.times_s <= end_s)).any():
+                tpose = look_at_tpose(subject, settings, track)
+        worn.append(Worn(settings=settings, track=track, tpose=tpose))
+    return worn
+
+
+def calibrate_from_tpose(session: Session) -> list[tuple[CalibratedImu, TPose]]:
+    """Every sensor of every subject; raises `SessionError` without a T-pose."""
+    found = []
+    for subject in wearers(session):
+        for settings, track in zip(subject.imus, open_imus(subject), strict=True):
+            pose = look_at_tpose(subject, settings, track)
+            xyzw = Rotation.from_matrix(pose.bone_from_imu).as_quat(canonical=True)
+            imu = CalibratedImu(
+                subject=subject.name,
+                bone=settings.bone,
+                bone_from_imu_wxyz=_wxyz(xyzw),
+                heading_deg=settings.heading_deg,
+            )
+            found.append((imu, pose))
+    return found
+
+
+def calibrated_imus(found: Sequence[SubjectCalibration]) -> list[CalibratedImu]:
+    """The values that are worth writing."""
+    return [
+        CalibratedImu(
+            subject=sensor.subject,
+            bone=sensor.bone,
+            bone_from_imu_wxyz=sensor.bone_from_imu_wxyz,
+            heading_deg=sensor.heading_deg,
+        )
+        for subject in found
+        for sensor in subject.sensors
+        if sensor.usable
+    ]
+
+
+def _wxyz(xyzw: np.ndarray) -> tuple[float, float, float, float]:
+    return float(xyzw[3]), float(xyzw[0]), float(xyzw[1]), float(xyzw[2])

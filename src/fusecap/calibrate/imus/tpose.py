@@ -1,0 +1,91 @@
+"""R_ib from a T-pose: the bones' rotations are known, so one look at each sensor is enough.
+
+The heading cannot be found so and stays as stated. Whatever the subject's pose deviates from the
+rest pose, R_ib is off by; nothing in the recording tells, but these two do tell that something
+else is wrong: a sensor that turned meanwhile (the subject moved), and a specific force that does
+not point up in the sensor's own world (it moved as well, or `imu_up` is wrong).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from fusecap.errors import SessionError
+from fusecap.sources.imu_files.track import ImuTrack
+from fusecap.sources.session import ImuSettings, SubjectSettings
+from fusecap.sources.synchronizer import world_from_imu_world
+
+STILL_DEG = 4.0
+"""A sensor that stays within this of its mean is on a person who stands still."""
+GRAVITY_DEG = 5.0
+TPOSE_SIGMA_RAD = np.radians(7.0)
+"""Per axis, how far a person's bones are from the rest pose in what they take for a T-pose. An
+assumption: no source for it was found."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TPose:
+    """One sensor in the T-pose."""
+
+    time_s: float
+    bone_in_world: Float[np.ndarray, "3 3"]
+    sensor_in_imu_world: Float[np.ndarray, "3 3"]
+    """Mean, with up along y, without the stated heading."""
+    bone_from_imu: Float[np.ndarray, "3 3"]
+    """With the stated heading."""
+    moved_deg: float
+    """95th percentile of the angle from the mean."""
+    gravity_deg: float
+    """Between the mean specific force and up; NaN without an accelerometer."""
+
+    @property
+    def complaints(self) -> tuple[str, ...]:
+        """What speaks against it, in words."""
+        said = []
+        if self.moved_deg > STILL_DEG:
+            said.append(f"moved by {self.moved_deg:.1f} deg during the T-pose")
+        if self.gravity_deg > GRAVITY_DEG:
+            said.append(f"gravity is {self.gravity_deg:.1f} deg off up during the T-pose")
+        return tuple(said)
+
+
+def look_at_tpose(subject: SubjectSettings, imu: ImuSettings, track: ImuTrack) -> TPose:
+    """The sensor within `tpose_s`; raises `SessionError` without an interval or samples in it."""
+    where = f"imu '{imu.bone}' of '{subject.name}'"
+    if subject.tpose_s is None:
+        raise SessionError(
+            f"{where}: subject '{subject.name}' has no tpose_s; give the interval in which it "
+            "stands in the rest pose, or calibrate with --from motion"
+        )
+    start_s, end_s = subject.tpose_s
+    inside = (track.times_s >= start_s) & (track.times_s <= end_s)
+    if not inside.any():
+        raise SessionError(
+            f"{where}: no sample in tpose_s = [{start_s:g}, {end_s:g}]; its samples run from "
+            f"{track.times_s[0]:g} to {track.times_s[-1]:g} s"
+        )
+    upright = world_from_imu_world(imu.imu_up, 0.0)
+    turned = Rotation.from_quat(track.orientation_wxyz[inside][:, [1, 2, 3, 0]])
+    mean = turned.mean()
+    accel = track.accel_m_s2[inside]
+    known = np.isfinite(accel).all(axis=1)
+    gravity_deg = float("nan")
+    if known.any():
+        force = upright @ Rotation.from_quat(turned.as_quat()[known]).apply(accel[known]).mean(
+            axis=0
+        )
+        gravity_deg = float(np.degrees(np.arccos(force[1] / np.linalg.norm(force))))
+    bone = Rotation.from_euler("y", subject.tpose_facing_deg, degrees=True).as_matrix()
+    sensor = upright @ mean.as_matrix()
+    return TPose(
+        time_s=(start_s + end_s) / 2,
+        bone_in_world=bone,
+        sensor_in_imu_world=sensor,
+        bone_from_imu=bone.T @ world_from_imu_world("y", imu.heading_deg) @ sensor,
+        moved_deg=float(np.degrees(np.percentile((mean.inv() * turned).magnitude(), 95))),
+        gravity_deg=gravity_deg,
+    )

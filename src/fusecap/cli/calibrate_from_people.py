@@ -1,0 +1,147 @@
+"""`fusecap calibrate extrinsics --from-people`: cameras refined from the people they see."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from fusecap.cli.common import check_choice, console, err, print_json, progress
+
+if TYPE_CHECKING:
+    from fusecap.calibrate.cameras.people import PeopleCalibration
+
+REFINE = ("focal", "centre", "distortion")
+
+
+def from_people(
+    session: Path,
+    *,
+    out: Path,
+    refine: Sequence[str] = (),
+    picture: bool = True,
+    as_json: bool = False,
+) -> None:
+    """Refine the session's cameras, report, and write them where held-out keypoints agree better.
+
+    Exit code 1, and nothing written, where they do not.
+    """
+    for name in refine:
+        check_choice("--refine", name, REFINE)
+
+    from fusecap.calibrate.cameras.people import refine_from_people
+    from fusecap.calibrate.cameras.people_plot import plot_residuals
+    from fusecap.sources.calibration_files.writer import write_rig
+    from fusecap.sources.session import load_session
+    from fusecap.sources.session_data import open_session
+
+    with progress(quiet=as_json) as show:
+        data = open_session(load_session(session), show)
+        found = refine_from_people(data, refine=refine, progress=show)
+    files: list[Path] = []
+    if found.improved:
+        files += write_rig(out, found.rig, notes=_origin(found, data.session.settings.name))
+    if picture:
+        image = out.with_suffix(".png")
+        plot_residuals(found, image)
+        files.append(image)
+    if as_json:
+        print_json(_as_json(found, files))
+    else:
+        _print_report(found)
+        for path in files:
+            console.print(f"wrote {path}", markup=False, soft_wrap=True)
+        if found.improved:
+            console.print(
+                f'use it: under [session] calibration = "{out.name}" and up = "y"',
+                markup=False,
+                soft_wrap=True,
+            )
+    if not found.improved:
+        raise typer.Exit(1)
+
+
+def _origin(found: PeopleCalibration, session: str) -> list[str]:
+    return [
+        f"refined from the people of '{session}', {found.fit_person_instants} person-instants; "
+        f"world y up, metres, floor and origin of the rough calibration",
+        f"held-out keypoints, median: {found.before.median_px:.2f} -> "
+        f"{found.after.median_px:.2f} px",
+    ]
+
+
+def _as_json(found: PeopleCalibration, files: Sequence[Path]) -> dict[str, object]:
+    from dataclasses import asdict, fields, replace
+
+    from fusecap.geometry.camera import Rig
+
+    plain = asdict(replace(found, rig=Rig(cameras=()), residuals_px={}))
+    kept = {f.name for f in fields(found)} - {"rig", "residuals_px"}
+    report = {name: _no_nan(value) for name, value in plain.items() if name in kept}
+    return report | {"files": [str(path) for path in files]}
+
+
+def _no_nan(value: object) -> object:
+    if isinstance(value, dict):
+        return {key: _no_nan(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_no_nan(item) for item in value]
+    return None if isinstance(value, float) and value != value else value
+
+
+def _print_report(found: PeopleCalibration) -> None:
+    from rich.table import Table
+
+    console.print(
+        f"{found.fit_person_instants} person-instants of {found.blocks[0]} blocks adjusted in "
+        f"{found.rounds} rounds; {found.check_person_instants} of {found.blocks[1]} other blocks "
+        f"({found.block_s:.2g} s each) checked",
+        soft_wrap=True,
+    )
+    table = Table(
+        "camera", "held-out px: median", "90 %", "skeleton", "moved mm", "deg", "known to mm", "deg"
+    )
+    for column in table.columns:
+        column.no_wrap = True
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for c in found.cameras:
+        table.add_row(
+            c.name,
+            f"{c.before.median_px:.1f} -> {c.after.median_px:.1f}",
+            f"{c.before.p90_px:.1f} -> {c.after.p90_px:.1f}",
+            f"{c.skeleton_before_px:.1f} -> {c.skeleton_after_px:.1f}",
+            f"{c.moved_mm:.0f}",
+            f"{c.turned_deg:.2f}",
+            f"{c.repeat_mm:.0f} ({c.sigma_mm:.0f})",
+            f"{c.repeat_deg:.2f} ({c.sigma_deg:.2f})",
+        )
+    console.print(table)
+    console.print(
+        "  known to: scatter over resampled blocks (from the normal equations)", soft_wrap=True
+    )
+    refined = f"poses and {', '.join(found.refined)}" if found.refined else "poses"
+    console.print(
+        f"  {refined}; scale {found.scale:.4f}, from {found.scale_from}; people walked "
+        f"{found.walked_m[0]:.1f} x {found.walked_m[1]:.1f} m; feet {1e3 * found.feet_m:+.0f} mm "
+        "from the floor",
+        soft_wrap=True,
+    )
+    if found.refined:
+        console.print(
+            "  focal lengths "
+            + ", ".join(f"{c.name} {100 * (c.focal_share - 1):+.1f} %" for c in found.cameras),
+            soft_wrap=True,
+        )
+    for note in found.notes:
+        err.print("[yellow]note[/] ", end="")
+        err.print(note, markup=False, soft_wrap=True)
+    verdict = "better than before" if found.improved else "not better: keep the old calibration"
+    console.print(
+        f"verdict: {verdict}; all cameras, held out: median {found.before.median_px:.1f} -> "
+        f"{found.after.median_px:.1f} px, 90 % {found.before.p90_px:.1f} -> "
+        f"{found.after.p90_px:.1f} px",
+        soft_wrap=True,
+    )

@@ -1,0 +1,288 @@
+"""`fusecap calibrate imu`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from fusecap.cli.common import (
+    Json,
+    SessionPath,
+    check_choice,
+    console,
+    err,
+    print_json,
+    progress,
+)
+
+if TYPE_CHECKING:
+    from fusecap.calibrate.imus.identify import Identity
+    from fusecap.calibrate.imus.motion import SubjectCalibration
+    from fusecap.calibrate.imus.tpose import TPose
+    from fusecap.sources.imu_calibration_files import CalibratedImu
+
+EXAMPLE = "Example: fusecap calibrate imu recordings/duo --out recordings/duo/imu_calibration.toml"
+
+
+def imu(
+    session: SessionPath,
+    source: Annotated[
+        str, typer.Option("--from", help="motion that the cameras saw, or tpose.")
+    ] = "motion",
+    take: Annotated[
+        Path | None,
+        typer.Option(help="A take of the same motion; without, the cameras are solved."),
+    ] = None,
+    optical: Annotated[
+        bool,
+        typer.Option("--optical", help="The take observes all axes of all bones, as markers do."),
+    ] = False,
+    identify: Annotated[
+        bool, typer.Option("--identify", help="Only tell which sensor is on which bone.")
+    ] = False,
+    out: Annotated[Path, typer.Option(help="The calibration to write; pictures go beside it.")] = (
+        Path("imu_calibration.toml")
+    ),
+    as_json: Json = False,
+) -> None:
+    """How sensors sit on their bones; a session uses the result as imu_calibration.
+
+    Residuals are measured on stretches of time that were left out.
+    """
+    from fusecap.calibrate.imus import session as calibration
+    from fusecap.sinks.take import load_take
+    from fusecap.sources.session import load_session
+
+    check_choice("--from", source, ("motion", "tpose"))
+    if source == "tpose" and (take is not None or optical or identify):
+        raise typer.BadParameter(
+            "a T-pose needs no motion; leave out --take, --optical and --identify",
+            param_hint="--from",
+        )
+    if optical and take is None:
+        raise typer.BadParameter(
+            "needs --take: cameras do not observe all axes", param_hint="--optical"
+        )
+    loaded = load_session(session)
+    calibration.wearers(loaded)
+    if source == "tpose":
+        _report_tpose(calibration.calibrate_from_tpose(loaded), out, as_json)
+        return
+    with progress(quiet=as_json) as show:
+        motion = load_take(take) if take else calibration.seen_by_cameras(loaded, show)
+    reference = calibration.references(loaded, motion, optical=optical)
+    if identify:
+        _report_identities(calibration.identify_sensors(loaded, reference), as_json)
+        return
+    _report(calibration.calibrate_from_motion(loaded, reference), out, as_json)
+
+
+def _report(found: tuple[SubjectCalibration, ...], out: Path, as_json: bool) -> None:
+    from dataclasses import asdict
+
+    from fusecap.calibrate.imus.plot import plot_residuals
+    from fusecap.calibrate.imus.session import calibrated_imus
+    from fusecap.sinks.files import safe_name
+
+    imus = calibrated_imus(found)
+    seconds = ", ".join(f"{each.duration_s:.1f} s of '{each.subject}'" for each in found)
+    files = _write(imus, out, f"motion: {seconds}")
+    for each in found:
+        if each.sensors:
+            picture = out.with_name(f"{out.stem}_{safe_name(each.subject)}.png")
+            plot_residuals(each, picture)
+            files.append(picture)
+    if as_json:
+        subjects = [
+            {key: value for key, value in asdict(each).items() if key != "series"} for each in found
+        ]
+        print_json({"subjects": subjects, "files": [str(file) for file in files]})
+    else:
+        for each in found:
+            _print_subject(each)
+        _print_files(files, imus, out)
+    if not imus:
+        raise typer.Exit(1)
+
+
+def _print_subject(found: SubjectCalibration) -> None:
+    from rich.table import Table
+
+    lag = f", sensors {found.lag_s:+.2f} s late" if found.lag_s else ""
+    console.print(
+        f"[bold]{found.subject}[/]: {found.duration_s:.1f} s seen{lag}; angular speeds of cameras "
+        f"and sensors correlate by {found.speed_correlation:.2f}",
+        soft_wrap=True,
+    )
+    table = Table(
+        "bone",
+        "R_ib w x y z",
+        "heading",
+        "sigma xyz",
+        "held out",
+        "verdict",
+        box=None,
+        padding=(0, 1, 0, 0),
+    )
+    for column in table.columns[1:-1]:
+        column.justify = "right"
+    for column in table.columns:
+        column.no_wrap = True
+    for sensor in found.sensors:
+        colour = "green" if sensor.verdict == "good" else "yellow" if sensor.usable else "red"
+        table.add_row(
+            sensor.bone,
+            " ".join(f"{value:5.2f}" for value in sensor.bone_from_imu_wxyz),
+            f"{sensor.heading_deg:.1f}",
+            " ".join(f"{min(value, 180):2.0f}" for value in sensor.sigma_deg),
+            f"{sensor.held_out_deg:.1f}",
+            f"[{colour}]{sensor.verdict}[/]",
+        )
+    console.print(table)
+    console.print(
+        "  degrees; sigma: uncertainty about the bone's x, y, z; held out: median angle between "
+        "sensor and cameras on stretches that were left out",
+        soft_wrap=True,
+    )
+    stated = [each.stated_deg for each in found.sensors if each.stated_deg is not None]
+    if stated:
+        now = [each.held_out_deg for each in found.sensors if each.stated_deg is not None]
+        console.print(
+            f"  mean of the medians {sum(now) / len(now):.1f} deg held out, "
+            f"{sum(stated) / len(stated):.1f} deg as the session states them",
+            soft_wrap=True,
+        )
+    for sensor in found.sensors:
+        if abs(sensor.drift_deg_min) > max(3.0, 3.0 * sensor.drift_sigma_deg_min):
+            err.print(
+                f"[yellow]note[/] {sensor.bone}: its heading drifts by "
+                f"{sensor.drift_deg_min:.1f} deg a minute; calibrate again for later recordings",
+                soft_wrap=True,
+            )
+        if sensor.share < 0.9:
+            err.print(
+                f"[yellow]note[/] {sensor.bone}: its samples cover {100 * sensor.share:.0f} % of "
+                "what the cameras saw",
+                soft_wrap=True,
+            )
+    advice: dict[tuple[str, str], list[str]] = {}
+    for sensor in found.sensors:
+        if sensor.remedy:
+            advice.setdefault((sensor.verdict, sensor.remedy), []).append(sensor.bone)
+    for (verdict, remedy), bones in advice.items():
+        err.print(f"[yellow]{verdict}[/] {', '.join(bones)}: {remedy}", soft_wrap=True)
+    for sensor in found.skipped:
+        err.print(
+            f"[red]not calibrated[/] {sensor.bone} ({sensor.file}): {sensor.reason}",
+            soft_wrap=True,
+        )
+
+
+def _report_identities(found: dict[str, tuple[Identity, ...]], as_json: bool) -> None:
+    from dataclasses import asdict
+
+    from rich.table import Table
+
+    from fusecap.calibrate.imus.identify import SURE
+
+    if as_json:
+        subjects = {name: [asdict(each) for each in some] for name, some in found.items()}
+        print_json({"subjects": subjects, "sure_margin": SURE})
+        return
+    for name, identities in found.items():
+        console.print(f"[bold]{name}[/]")
+        table = Table("stated", "moves like", "margin", "runner-up", "speed corr.", "verdict")
+        for each in identities:
+            if each.margin <= SURE:
+                verdict = f"[yellow]unsure: {each.found} and {each.runner_up} move alike here[/]"
+            elif each.found != each.stated:
+                verdict = f'[red]write bone = "{each.found}"[/]'
+            else:
+                verdict = "[green]as stated[/]"
+            table.add_row(
+                each.stated,
+                each.found,
+                f"{each.margin:.2f}",
+                each.runner_up,
+                f"{each.speed_correlation:.2f}",
+                verdict,
+            )
+        console.print(table, soft_wrap=True)
+    console.print(
+        f"  a margin above {SURE:g} is sure; below it, let the subject move one limb at a time, "
+        "left and right differently",
+        soft_wrap=True,
+    )
+
+
+def _report_tpose(found: list[tuple[CalibratedImu, TPose]], out: Path, as_json: bool) -> None:
+    imus = [imu for imu, pose in found if not pose.complaints]
+    files = _write(imus, out, "T-pose")
+    if as_json:
+        rows = [
+            {
+                "subject": imu.subject,
+                "bone": imu.bone,
+                "bone_from_imu_wxyz": imu.bone_from_imu_wxyz,
+                "heading_deg": imu.heading_deg,
+                "moved_deg": pose.moved_deg,
+                "gravity_deg": None if pose.gravity_deg != pose.gravity_deg else pose.gravity_deg,
+                "complaints": pose.complaints,
+            }
+            for imu, pose in found
+        ]
+        print_json({"imus": rows, "files": [str(file) for file in files]})
+    else:
+        _print_tpose(found)
+        _print_files(files, imus, out)
+    if not imus:
+        raise typer.Exit(1)
+
+
+def _print_tpose(found: list[tuple[CalibratedImu, TPose]]) -> None:
+    from rich.table import Table
+
+    table = Table("subject", "bone", "R_ib w, x, y, z", "moved deg", "gravity deg", "verdict")
+    for imu, pose in found:
+        verdict = "[red]" + "; ".join(pose.complaints) + "[/]" if pose.complaints else "still"
+        table.add_row(
+            imu.subject,
+            imu.bone,
+            " ".join(f"{value:6.3f}" for value in imu.bone_from_imu_wxyz),
+            f"{pose.moved_deg:.1f}",
+            f"{pose.gravity_deg:.1f}",
+            verdict,
+        )
+    console.print(table, soft_wrap=True)
+    if any(pose.complaints for _, pose in found):
+        err.print(
+            "[yellow]note[/] these sensors were left out: choose a stretch of tpose_s in which the "
+            "subject stands still; gravity off for all of them is a wrong imu_up",
+            soft_wrap=True,
+        )
+    console.print(
+        "  R_ib is as exact as the subject's T-pose; check it on motion with --from motion",
+        soft_wrap=True,
+    )
+
+
+def _write(imus: list[CalibratedImu], out: Path, origin: str) -> list[Path]:
+    from fusecap.sinks.files import written_whole
+    from fusecap.sources.imu_calibration_files import imu_calibration_toml
+
+    if not imus:
+        return []
+    with written_whole(out) as file:
+        file.write(imu_calibration_toml(imus, origin=origin).encode())
+    return [out]
+
+
+def _print_files(files: list[Path], imus: list[Any], out: Path) -> None:
+    for file in files:
+        console.print(f"wrote {file}", soft_wrap=True)
+    if imus:
+        console.print(f'use it: imu_calibration = "{out.name}" under \\[session]', soft_wrap=True)
+    else:
+        err.print("[red]nothing was written[/]: no sensor could be calibrated", soft_wrap=True)

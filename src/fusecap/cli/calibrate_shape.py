@@ -1,0 +1,166 @@
+"""`fusecap calibrate shape`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fusecap.cli.common import Json, SessionPath, console, err, print_json, progress
+
+if TYPE_CHECKING:
+    from fusecap.calibrate.shape import MeasuredBody, ShapeCalibration
+    from fusecap.scene import Scene
+    from fusecap.solve.estimator import SubjectModel
+    from fusecap.sources.session_data import SessionData
+
+EXAMPLE = "Example: fusecap calibrate shape recordings/rom --subject anna --out anna.toml"
+_LIMBS = tuple(
+    f"{side}_{bone}" for side in ("left", "right") for bone in ("forearm", "hand", "shank", "foot")
+)
+"""Named after the bones at the far end of upper arm, forearm, thigh and shank."""
+
+
+def shape(
+    session: SessionPath,
+    subject: Annotated[str | None, typer.Option(help="Only this person.")] = None,
+    out: Annotated[
+        Path, typer.Option(help="Subject tables to write; a plot goes beside, as .png.")
+    ] = Path("shape.toml"),
+    as_json: Json = False,
+) -> None:
+    """Bone lengths from a recording in which every joint bends, with their uncertainty.
+
+    Measures on the first three quarters of the session and checks the result on the rest.
+    """
+    from dataclasses import asdict
+
+    from fusecap.calibrate.shape import calibrate_shape, shape_toml
+    from fusecap.calibrate.shape_plot import plot_bodies
+    from fusecap.scene import SessionInstants
+    from fusecap.sinks.files import written_whole
+    from fusecap.sources.session import load_session
+    from fusecap.sources.session_data import open_session
+
+    with progress(quiet=as_json) as show:
+        data = open_session(load_session(session), show)
+        found = calibrate_shape(
+            lambda subjects: _scene(data, subjects),
+            lambda first, end: SessionInstants(data, first, end),
+            len(data.times_s),
+            heights_m={s.name: s.height_m for s in data.session.subjects if s.height_m},
+            subject=subject,
+            progress=show,
+        )
+    origin = f"measured in '{data.session.settings.name}'"
+    with written_whole(out) as file:
+        file.write(shape_toml(found.bodies, origin=origin).encode())
+    picture = out.with_suffix(".png")
+    plot_bodies(found.bodies, picture)
+    problems = _problems(found)
+    if as_json:
+        bodies = [
+            {key: value for key, value in vars(body).items() if key not in ("shape", "bones")}
+            | {"bones": [asdict(bone) for bone in body.bones]}
+            for body in found.bodies
+        ]
+        print_json(
+            {
+                "bodies": bodies,
+                "held_out_before_px": asdict(found.held_out_before_px),
+                "held_out_after_px": asdict(found.held_out_after_px),
+                "problems": problems,
+                "files": [str(out), str(picture)],
+            }
+        )
+        return
+    for body in found.bodies:
+        _print_body(body)
+    before, after = found.held_out_before_px, found.held_out_after_px
+    console.print(
+        f"held-out instants: reprojection {before.median:.2f} -> {after.median:.2f} px median, "
+        f"{before.mean:.2f} -> {after.mean:.2f} px mean, {after.count} keypoints",
+        soft_wrap=True,
+    )
+    for problem in problems:
+        err.print("[yellow]poor[/] ", end="")
+        err.print(problem, markup=False, soft_wrap=True)
+    console.print(f"wrote {out}\nwrote {picture}", markup=False, soft_wrap=True)
+    console.print("use it: copy height_m and bone_lengths_m into the session's \\[\\[subject]]")
+
+
+def _scene(data: SessionData, subjects: Sequence[SubjectModel] | None) -> Scene:
+    from dataclasses import replace
+
+    from fusecap.scene import make_sorter, scene_of
+
+    scene = scene_of(data)
+    if subjects is None:
+        return scene
+    settings = data.session.settings
+    sorter = make_sorter(
+        data.rig,
+        scene.landmarks,
+        subjects,
+        associate=settings.associate,
+        max_subjects=settings.max_subjects,
+        volume_m=settings.volume_m,
+    )
+    return replace(scene, subjects=tuple(subjects), sorter=sorter)
+
+
+def _problems(found: ShapeCalibration) -> list[str]:
+    problems = []
+    for body in found.bodies:
+        untold = [name for name in _LIMBS if name not in body.lengths_m]
+        if untold:
+            problems.append(
+                f"{body.name}: {', '.join(untold)} follow the stature; bend the joints on both "
+                "ends of these bones in view of two cameras or more"
+            )
+        odd = [
+            bone.bone.removeprefix("left_")
+            for bone in body.bones
+            if bone.asymmetry_m is not None
+            and bone.asymmetry_sigma_m is not None
+            and abs(bone.asymmetry_m) > 3 * bone.asymmetry_sigma_m
+        ]
+        if odd:
+            problems.append(
+                f"{body.name}: left and right differ beyond their uncertainty ({', '.join(odd)}); "
+                "look for left taken for right, or a camera that is calibrated loosely"
+            )
+    if not found.held_out_after_px.median <= 1.02 * found.held_out_before_px.median:
+        problems.append(
+            "the held-out instants are not explained as well as before; the landmarks' offsets "
+            "may not be this detector's: run fusecap calibrate offsets first"
+        )
+    return problems
+
+
+def _print_body(body: MeasuredBody) -> None:
+    from rich.table import Table
+
+    how = "stated" if body.height_stated else f"+- {1e3 * body.height_sigma_m:.0f} mm"
+    console.print(
+        f"{body.name}: stature {body.height_m:.3f} m ({how}), {body.instants} instants",
+        markup=False,
+    )
+    table = Table("bone", "length mm", "+-", "by stature mm", "left - right mm", "told by")
+    for column in table.columns[1:5]:
+        column.justify = "right"
+    for bone in body.bones:
+        difference = ""
+        if bone.asymmetry_m is not None and bone.asymmetry_sigma_m is not None:
+            difference = f"{1e3 * bone.asymmetry_m:.1f} +- {1e3 * bone.asymmetry_sigma_m:.1f}"
+        table.add_row(
+            bone.bone,
+            f"{1e3 * bone.length_m:.1f}",
+            f"{1e3 * bone.sigma_m:.1f}",
+            f"{1e3 * bone.from_height_m:.1f}",
+            difference,
+            "data" if bone.told else "stature",
+        )
+    console.print(table)

@@ -1,0 +1,160 @@
+"""`fusecap calibrate sync`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fusecap.cli.common import Json, SessionPath, console, err, print_json, progress
+from fusecap.errors import InputError
+
+if TYPE_CHECKING:
+    from fusecap.calibrate.sync.session import Row, Synchronisation
+
+EXAMPLE = "Example: fusecap calibrate sync recordings/duo --write --plot recordings/duo/sync.png"
+
+
+def sync(
+    session: SessionPath,
+    out: Annotated[
+        Path | None, typer.Option(help="Write the clocks to this file.", show_default=False)
+    ] = None,
+    write: Annotated[
+        bool,
+        typer.Option("--write", help="Write sync.toml beside the session, and name it there."),
+    ] = False,
+    max_offset: Annotated[
+        float, typer.Option(min=0.1, max=600.0, help="Largest offset looked for, in seconds.")
+    ] = 10.0,
+    plot: Annotated[
+        Path | None, typer.Option(help="Draw curves and offsets (.png).", show_default=False)
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """When cameras and sensors recorded, from the people they saw: offset and drift of each clock.
+
+    Session time = own time + offset. Exit code 1 where a clock could not be told.
+    """
+    from dataclasses import asdict
+
+    from fusecap.calibrate.sync.session import synchronise
+    from fusecap.sinks.files import written_whole
+    from fusecap.sources.session import missing_files, parse_session
+    from fusecap.sources.sync_files import sync_toml
+
+    if out is not None and write:
+        raise typer.BadParameter("give --out or --write, not both", param_hint="--out")
+    opened = parse_session(session)
+    needed = ("[session] calibration", "[session] sync")
+    missing = [line for line in missing_files(opened) if not line.startswith(needed)]
+    if missing:
+        raise InputError("\n".join(f"{opened.path}: {line}" for line in missing))
+    with progress(quiet=as_json) as show:
+        found = synchronise(opened, max_offset_s=max_offset, progress=show)
+    if write:
+        out = opened.path.parent / "sync.toml"
+    if plot is not None:
+        from fusecap.calibrate.sync.plot import draw
+
+        draw(found, plot)
+    if out is not None:
+        with written_whole(out) as file:
+            file.write(sync_toml(found.clocks, origin=_origin(found)).encode())
+    named = _name(opened.path) if write else False
+    if as_json:
+        print_json(
+            {
+                "reference": found.reference,
+                "complete": found.complete,
+                "clocks": [asdict(row) for row in found.rows],
+                "notes": list(found.notes),
+                "file": None if out is None else str(out),
+            }
+        )
+    else:
+        _print_report(found)
+        if out is not None:
+            console.print(f"wrote {out}", soft_wrap=True)
+            if not write:
+                console.print('use it: sync = "..." under \\[session]', soft_wrap=True)
+        if write and not named:
+            console.print(f"{opened.path.name} names it already", soft_wrap=True)
+        if plot is not None:
+            console.print(f"wrote {plot}", soft_wrap=True)
+    if not found.complete:
+        raise typer.Exit(1)
+
+
+def _origin(found: Synchronisation) -> str:
+    cameras = sum(row.kind == "camera" for row in found.rows)
+    imus = len(found.rows) - cameras
+    return f"{cameras} cameras, {imus} IMU clocks; reference camera {found.reference}"
+
+
+def _name(path: Path) -> bool:
+    """Adds `sync = "sync.toml"` below [session] unless a sync is named; whether it did."""
+    import re
+    import tomllib
+
+    from fusecap.sinks.files import written_whole
+
+    text = path.read_text(encoding="utf-8")
+    if "sync" in tomllib.loads(text).get("session", {}):
+        return False
+    changed = re.sub(
+        r"^(\s*\[\s*session\s*\][^\n]*)$", r'\1\nsync = "sync.toml"', text, count=1, flags=re.M
+    )
+    with written_whole(path) as file:
+        file.write(changed.encode())
+    return True
+
+
+def _print_report(found: Synchronisation) -> None:
+    from rich.table import Table
+
+    table = Table("clock", "offset ms", "error ms", "drift ms/min", "verdict")
+    for column in table.columns[1:4]:
+        column.justify = "right"
+    for row in found.rows:
+        table.add_row(_label(row), *_numbers(row), row.verdict)
+    console.print(table)
+    console.print(
+        "  session time = own time + offset: a positive offset means that the clock's zero is that "
+        "much later than the session's. Errors are standard errors.",
+        soft_wrap=True,
+    )
+    if found.cameras is not None and found.cameras.refined:
+        before, after = found.cameras.residual_px
+        console.print(
+            f"  views disagree by {before:.1f} -> {after:.1f} px (median, of an image 1920 wide)",
+            soft_wrap=True,
+        )
+    for name, stamp in found.stamps.items():
+        console.print(
+            f"  {name}: foot stamp at {stamp.video_s:.2f} s in the video, {stamp.offset_s:+.3f} s "
+            f"on '{stamp.bone}'",
+            soft_wrap=True,
+        )
+    for note in found.notes:
+        err.print(f"[yellow]note[/] {note}", soft_wrap=True)
+    for row in found.rows:
+        if row.said:
+            err.print(f"[yellow]{row.verdict}[/] {_label(row)}: {row.said}", soft_wrap=True)
+
+
+def _label(row: Row) -> str:
+    if row.kind == "camera":
+        return f"camera '{row.name}'"
+    some = row.sensors[0] if len(row.sensors) == 1 else f"{len(row.sensors)} sensors"
+    return f"imu '{row.name}', {some}"
+
+
+def _numbers(row: Row) -> tuple[str, str, str]:
+    offset = "-" if row.offset_s is None else f"{1e3 * row.offset_s:+.1f}"
+    error = "-" if row.error_s is None or row.verdict == "reference" else f"{1e3 * row.error_s:.1f}"
+    if row.drift_ppm is None or row.drift_error_ppm is None:
+        return offset, error, "-"
+    drift = f"{0.06 * row.drift_ppm:+.2f} ± {0.06 * row.drift_error_ppm:.2f}"
+    return offset, error, drift if row.drift_used else f"({drift})"

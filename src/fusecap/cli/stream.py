@@ -1,0 +1,230 @@
+"""`fusecap stream`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from fusecap.cli.common import Json, console, err, print_json
+
+if TYPE_CHECKING:
+    from fusecap.live.playback import PlaybackState, TakePlayer
+    from fusecap.live.streams import Stream
+    from fusecap.live.target import Target
+
+EXAMPLE = "Example: fusecap stream demo/demo.npz --to vmc://127.0.0.1:39539 --to ws --loop"
+
+_ON_TIME = 0.98
+"""Share of the take's rate below which a playback did not keep up."""
+
+
+def stream(
+    take: Annotated[Path, typer.Argument(help="A solved take (.npz).", show_default=False)],
+    to: Annotated[
+        list[str],
+        typer.Option(
+            help="Where to: vmc, livelink, rokoko, osc, each with ://HOST:PORT unless the usual "
+            "port of this machine will do; ws (serves WebSocket clients); lsl. Repeatable.",
+            show_default=False,
+        ),
+    ],
+    loop: Annotated[
+        bool, typer.Option("--loop", help="Start again at the end, until Ctrl-C.")
+    ] = False,
+    speed: Annotated[float, typer.Option(help="1 is the pace of the recording.")] = 1.0,
+    subject: Annotated[
+        list[str] | None, typer.Option(help="Only this person. Repeatable.", show_default=False)
+    ] = None,
+    host: Annotated[
+        str | None,
+        typer.Option(
+            help="Address on which ws serves clients; 0.0.0.0 opens it to other machines. "
+            "Without, only this machine can connect.",
+            show_default=False,
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Play a take into game engines and other programs, live.
+
+    Receivers, ports and axes are in docs/streams.md. Ctrl-C ends it.
+    """
+    from fusecap.live.playback import TakePlayer, play
+    from fusecap.live.streams import open_stream
+    from fusecap.live.target import parse_target
+    from fusecap.sinks.take import load_take
+
+    targets = _targets([parse_target(text) for text in to], host)
+    loaded = load_take(take)
+    player = TakePlayer(loaded, subjects=subject or (), speed=speed, loop=loop)
+    with ExitStack() as closing:
+        streams: list[Stream] = []
+        for target in targets:
+            streams.append(open_stream(target, player.cast, player.rate_hz))
+            closing.callback(streams[-1].close)
+        simulated = bool(loaded.provenance.get("simulated"))
+        if not as_json:
+            _announce(player, streams, simulated=simulated)
+        for target in targets:
+            _warn_if_open(target)
+        with _status(streams, quiet=as_json) as each_second:
+            state = play(player, streams, each_second=each_second)
+        remarks = [stream.remark() for stream in streams]
+    notes = _notes(player, state)
+    if as_json:
+        print_json({"simulated": simulated, **_report(state, player, streams, remarks, notes)})
+    else:
+        _print_end(state, streams, remarks, notes)
+    if state.interrupted and not loop:
+        raise typer.Exit(130)
+
+
+def _targets(targets: list[Target], host: str | None) -> list[Target]:
+    """Targets with `--host` in place; serving other machines takes that option."""
+    from fusecap.errors import InputError
+    from fusecap.live.target import is_loopback
+
+    if host is not None and all(target.protocol != "ws" for target in targets):
+        raise InputError("--host is the address on which ws serves clients; add --to ws")
+    placed = [
+        replace(target, host=host) if target.protocol == "ws" and host is not None else target
+        for target in targets
+    ]
+    for target in placed:
+        if target.protocol == "ws" and host is None and not is_loopback(target.host):
+            raise InputError(
+                f"--to {target}: this would let other machines connect; "
+                f"if that is meant, add --host {target.host}"
+            )
+    seen: set[str] = set()
+    for target in placed:
+        if str(target) in seen:
+            raise InputError(f"--to {target} is given twice")
+        seen.add(str(target))
+    return placed
+
+
+def _warn_if_open(target: Target) -> None:
+    from fusecap.live.target import is_loopback
+
+    if target.protocol == "ws" and not is_loopback(target.host):
+        err.print(
+            f"[yellow]note[/] {target} is open: whoever reaches this machine on port "
+            f"{target.port} can follow the motion; there is no password and no encryption",
+            soft_wrap=True,
+        )
+
+
+def _announce(player: TakePlayer, streams: Sequence[Stream], *, simulated: bool) -> None:
+    count = player.frame_count
+    length = "in a loop" if count is None else f"{count} frames, {count / player.rate_hz:.1f} s"
+    what = "simulated motion" if simulated else "motion"
+    console.print(
+        f"{what} of {', '.join(player.cast)} at {player.rate_hz:g} frames/s, {length}; "
+        "Ctrl-C ends it",
+        markup=False,
+        soft_wrap=True,
+    )
+    for stream in streams:
+        for name, address in stream.where().items() or (("everyone", str(stream.target)),):
+            console.print(f"  {name} -> {address}", markup=False, soft_wrap=True)
+
+
+@contextmanager
+def _status(
+    streams: Sequence[Stream], *, quiet: bool
+) -> Iterator[Callable[[PlaybackState], None] | None]:
+    """A line per second on stderr: overwritten on a terminal, one below the other elsewhere."""
+    if quiet:
+        yield None
+        return
+    if not err.is_terminal:
+        yield lambda state: err.print(_line(state, streams), markup=False, soft_wrap=True)
+        return
+    from rich.live import Live
+    from rich.text import Text
+
+    with Live(console=err, auto_refresh=False, transient=True) as live:
+        yield lambda state: live.update(Text(_line(state, streams)), refresh=True)
+
+
+def _line(state: PlaybackState, streams: Sequence[Stream]) -> str:
+    parts = [f"{state.elapsed_s:6.1f} s  {state.rate_hz:.1f} frames/s"]
+    for stream in streams:
+        counts = stream.counts
+        lost = counts.dropped + counts.failed
+        part = f"{stream.target.protocol} {counts.sent} sent, {lost} dropped"
+        parts.append(part + (f", {counts.refused} refused" if counts.refused else ""))
+    return "  |  ".join(parts)
+
+
+def _notes(player: TakePlayer, state: PlaybackState) -> list[str]:
+    """What a user should know about the pace."""
+    if state.frames + state.skipped == 0 or state.skipped <= (1 - _ON_TIME) * state.frames:
+        return []
+    return [
+        f"{state.skipped} of {state.frames + state.skipped} frames came too late and were left "
+        f"out ({state.rate_hz:.1f} of {player.rate_hz:g} frames/s); stream to fewer receivers or "
+        "at a lower --speed"
+    ]
+
+
+def _report(
+    state: PlaybackState,
+    player: TakePlayer,
+    streams: Sequence[Stream],
+    remarks: Sequence[str],
+    notes: Sequence[str],
+) -> dict[str, Any]:
+    return {
+        **asdict(state),
+        "rate_hz": state.rate_hz,
+        "take_rate_hz": player.rate_hz,
+        "subjects": list(player.cast),
+        "streams": [
+            {"to": str(stream.target), **asdict(stream.counts), "remark": remark}
+            | ({"where": stream.where()} if stream.where() else {})
+            for stream, remark in zip(streams, remarks, strict=True)
+        ],
+        "notes": list(notes),
+    }
+
+
+def _print_end(
+    state: PlaybackState,
+    streams: Sequence[Stream],
+    remarks: Sequence[str],
+    notes: Sequence[str],
+) -> None:
+    from rich.table import Table
+
+    console.print(
+        f"{state.frames} frames in {state.elapsed_s:.1f} s, {state.rate_hz:.2f} frames/s, "
+        f"{state.skipped} left out; sent {state.late_ms_median:.1f} ms after their time "
+        f"(median), {state.late_ms_p99:.1f} ms (p99)",
+        soft_wrap=True,
+    )
+    table = Table("to", "packets sent", "MB", "dropped", "refused", "failed")
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for stream in streams:
+        counts = stream.counts
+        table.add_row(
+            str(stream.target),
+            str(counts.sent),
+            f"{1e-6 * counts.bytes:.2f}",
+            str(counts.dropped),
+            str(counts.refused),
+            str(counts.failed),
+        )
+    console.print(table)
+    for stream, remark in zip(streams, remarks, strict=True):
+        if remark:
+            err.print(f"[yellow]note[/] {stream.target}: {remark}", soft_wrap=True)
+    for note in notes:
+        err.print(f"[yellow]note[/] {note}", soft_wrap=True)

@@ -1,0 +1,47 @@
+"""From options to a detector."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from fusecap.body.landmarks import LandmarkSet
+from fusecap.detect.detector import Detector, DetectorOptions
+from fusecap.detect.model_store import model_path
+from fusecap.detect.one_stage import OneStageDetector, is_one_stage
+from fusecap.detect.packing import PackedDetector, PackedPersonDetector
+from fusecap.detect.person import PersonDetector
+from fusecap.detect.pose import PoseNetwork
+from fusecap.detect.runtimes.network import Network, open_network
+from fusecap.detect.top_down import TopDownDetector
+from fusecap.errors import InputError
+
+Progress = Callable[[str, int, int], None]
+"""Called with (what, bytes done, bytes in all) during downloads."""
+
+
+def build_detector(
+    options: DetectorOptions,
+    progress: Progress | None = None,
+    *,
+    landmarks: LandmarkSet | None = None,
+    threads: int | None = None,
+) -> Detector:
+    """Fetch the networks where needed, load them and put them together.
+
+    `landmarks` says what the keypoints are where their number does not; `threads` None: all cores.
+    Raises `InputError` where a network is unknown, cannot be fetched or loaded, or does not fit.
+    """
+    if options.person_every < 1:
+        raise InputError(f"person_every is {options.person_every}, expected 1 or more instants")
+    network = _load(options.model, options.runtime, progress, threads)
+    if is_one_stage(network):
+        detector = OneStageDetector(network, landmarks)
+        return PackedDetector(detector) if options.packed else detector
+    pose = PoseNetwork(network, landmarks)
+    person = PersonDetector(_load(options.person_model, options.runtime, progress, threads))
+    finder = PackedPersonDetector(person) if options.packed else person
+    return TopDownDetector(finder, pose, options.person_every)
+
+
+def _load(model: str, runtime: str, progress: Progress | None, threads: int | None) -> Network:
+    return open_network(model_path(model, progress), runtime, threads)

@@ -1,0 +1,290 @@
+"""Networks by name: downloaded once, checked, kept in the user's cache.
+
+The files are OpenMMLab's exports for deployment, zip archives with one `end2end.onnx` each, at the
+addresses that Tau-J/rtmlib and open-mmlab/mmpose list. A checksum is of that .onnx file. Where it
+is None, no trustworthy record of it was at hand: then whatever came first is recorded beside the
+file, so a later change is noticed, but the first download is only as good as its HTTPS connection.
+
+The weights are Apache-2.0, but were trained on data sets of which some allow research only; whether
+that binds who uses the weights is for the user to judge.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import os
+import shutil
+import urllib.error
+import urllib.request
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from http.client import HTTPException
+from pathlib import Path
+from typing import BinaryIO
+
+from fusecap.errors import InputError, nearest
+
+Progress = Callable[[str, int, int], None]
+"""Called with (what, bytes done, bytes in all)."""
+
+TIMEOUT_S = 30.0
+"""Without a byte from the server."""
+MAX_BYTES = 2**31
+"""Of one network; no known one has half of it."""
+
+_CHUNK = 1 << 18
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StoredModel:
+    """A network that can be fetched."""
+
+    url: str
+    sha256: str | None
+    """Of the network's file, after unpacking; None: unknown."""
+    member: str | None = "end2end.onnx"
+    """Name of the file inside a zip archive, in whatever folder; None: `url` is the file itself."""
+    about: str = ""
+
+
+_OPENMMLAB = "https://download.openmmlab.com/mmpose/v1/projects"
+_HALPE = f"{_OPENMMLAB}/rtmposev1/onnx_sdk/rtmpose-{{}}_simcc-body7_pt-body7-halpe26_700e-{{}}.zip"
+_YOLOX = f"{_OPENMMLAB}/rtmposev1/onnx_sdk/yolox_{{}}_8xb8-300e_humanart-{{}}.zip"
+_RTMO = f"{_OPENMMLAB}/rtmo/onnx_sdk/rtmo-{{}}-600e_body7-640x640-{{}}.zip"
+
+MODELS: Mapping[str, StoredModel] = {
+    "rtmpose-t-halpe26": StoredModel(
+        url=_HALPE.format("t", "256x192-6020f8a6_20230605"),
+        sha256=None,
+        about="pose, 26 keypoints, 256x192, fastest",
+    ),
+    "rtmpose-s-halpe26": StoredModel(
+        url=_HALPE.format("s", "256x192-7f134165_20230605"),
+        sha256=None,
+        about="pose, 26 keypoints, 256x192",
+    ),
+    "rtmpose-m-halpe26": StoredModel(
+        url=_HALPE.format("m", "256x192-4d3e73dd_20230605"),
+        # Stated alike by several unrelated public repositories that pin this export.
+        sha256="26f3a19e61304a600dfb82d1001d41d24343b89fc70a33ffc84657e0b0bf2ecf",
+        about="pose, 26 keypoints, 256x192; the default",
+    ),
+    "rtmpose-l-halpe26": StoredModel(
+        url=_HALPE.format("l", "256x192-2abb7558_20230605"),
+        sha256=None,
+        about="pose, 26 keypoints, 256x192, slower and better",
+    ),
+    "rtmdet-nano-person": StoredModel(
+        url=f"{_OPENMMLAB}/rtmposev1/onnx_sdk/rtmdet_nano_8xb32-100e_coco-obj365-person-05d8511e.zip",
+        # As above.
+        sha256="8297e829ccc5590c8e2d32d5a211f322a0585fb7467eec85eb12c9525b0b95d6",
+        about="people's boxes; the default",
+    ),
+    "yolox-tiny-humanart": StoredModel(
+        url=_YOLOX.format("tiny", "6f3252f9"),
+        sha256=None,
+        about="people's boxes, 416x416",
+    ),
+    "yolox-m-humanart": StoredModel(
+        url=_YOLOX.format("m", "c2c7a14a"),
+        sha256=None,
+        about="people's boxes, 640x640, slower and better",
+    ),
+    "rtmo-s": StoredModel(
+        url=_RTMO.format("s_8xb32", "dac2bf74_20231211"),
+        sha256=None,
+        about="whole images, 17 keypoints, 640x640",
+    ),
+    "rtmo-m": StoredModel(
+        url=_RTMO.format("m_16xb16", "39e78cc4_20231211"),
+        sha256=None,
+        about="whole images, 17 keypoints, 640x640, slower and better",
+    ),
+}
+
+
+def cache_dir() -> Path:
+    """$FUSECAP_CACHE/models, $XDG_CACHE_HOME/fusecap/models or ~/.cache/fusecap/models."""
+    if own := os.environ.get("FUSECAP_CACHE"):
+        return Path(own) / "models"
+    if user := os.environ.get("XDG_CACHE_HOME"):
+        return Path(user) / "fusecap" / "models"
+    return Path.home() / ".cache" / "fusecap" / "models"
+
+
+def to_download(model: str) -> StoredModel | None:
+    """What `model_path` would fetch; None where nothing needs fetching."""
+    stored = MODELS.get(model)
+    return None if (cache_dir() / f"{model}.onnx").is_file() else stored
+
+
+def model_path(
+    model: str,
+    progress: Progress | None = None,
+    *,
+    models: Mapping[str, StoredModel] = MODELS,
+    cache: Path | None = None,
+    timeout_s: float = TIMEOUT_S,
+) -> Path:
+    """The file of a network: `model` where that is one, else the stored one of that name.
+
+    Raises `InputError` for an unknown name, a failed download and a file that is not what it was.
+    """
+    if model not in models:
+        path = Path(model).expanduser()
+        if path.is_file():
+            return path
+        if path.suffix in (".onnx", ".xml") or len(path.parts) > 1:
+            raise InputError(
+                f"{model}: no such file; expected a network (.onnx or OpenVINO .xml) or one of "
+                f"{', '.join(models)}"
+            )
+        raise InputError(
+            f"no network '{model}'{nearest(model, models)}; the path of a .onnx or .xml works too"
+        )
+    stored = models[model]
+    path = (cache_dir() if cache is None else cache) / f"{model}.onnx"
+    record = path.with_name(f"{path.name}.sha256")
+    try:
+        if not path.is_file():
+            _fetch(model, stored, path, record, progress, timeout_s)
+        elif (found := _sha256(path)) != (expected := _expected(stored, record, found)):
+            raise InputError(
+                f"{path}: its SHA-256 is {found}, expected {expected}; "
+                "delete the file and it is downloaded again"
+            )
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot keep the network '{model}' there ({error.strerror or error}); "
+            "set FUSECAP_CACHE to a folder that can be written"
+        ) from error
+    return path
+
+
+def _expected(stored: StoredModel, record: Path, found: str) -> str:
+    """The known or recorded checksum; that of a file put there by hand is recorded now."""
+    if stored.sha256 is not None:
+        return stored.sha256
+    if not record.is_file():
+        _write_record(record, found)
+    return record.read_text(encoding="ascii", errors="replace").strip()
+
+
+def _fetch(
+    name: str,
+    stored: StoredModel,
+    path: Path,
+    record: Path,
+    progress: Progress | None,
+    timeout_s: float,
+) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with _part(path, "download") as download, _part(path, "network") as network:
+        _download(name, stored, path, download, progress, timeout_s)
+        if stored.member is None:
+            download.replace(network)
+        else:
+            _unpack(name, stored, download, network)
+        found = _sha256(network)
+        if stored.sha256 is not None and found != stored.sha256:
+            raise InputError(
+                f"{stored.url}: the SHA-256 of '{name}' is {found}, expected {stored.sha256}; "
+                f"nothing was kept; {_by_hand(stored, path)}"
+            )
+        if stored.sha256 is None:
+            _write_record(record, found)
+        network.replace(path)
+
+
+@contextlib.contextmanager
+def _part(path: Path, what: str) -> Iterator[Path]:
+    """A name for an unfinished file beside `path`, gone at the end."""
+    part = path.with_name(f".{path.name}.{os.getpid()}.{what}.part")
+    try:
+        yield part
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _download(
+    name: str,
+    stored: StoredModel,
+    path: Path,
+    part: Path,
+    progress: Progress | None,
+    timeout_s: float,
+) -> None:
+    request = urllib.request.Request(stored.url, headers={"User-Agent": "fusecap"})
+    try:
+        with urllib.request.urlopen(request, timeout=timeout_s) as reply, part.open("wb") as file:
+            total = int(reply.headers.get("Content-Length") or 0)
+            done = _copy(reply, file, name, total, progress)
+    except urllib.error.HTTPError as error:
+        reason = f"the server says {error.code} {error.reason}"
+        error.close()
+    except urllib.error.URLError as error:
+        reason = str(error.reason)
+    except (HTTPException, TimeoutError, ConnectionError) as error:
+        reason = str(error) or type(error).__name__
+    else:
+        if done >= total:
+            return
+        reason = f"it ended after {done} of {total} bytes"
+    raise InputError(
+        f"cannot download the network '{name}' from {stored.url} ({reason}); "
+        f"{_by_hand(stored, path)}"
+    )
+
+
+def _copy(
+    reply: io.BufferedIOBase, file: BinaryIO, name: str, total: int, progress: Progress | None
+) -> int:
+    done = 0
+    while chunk := reply.read(_CHUNK):
+        done += len(chunk)
+        if done > MAX_BYTES:
+            raise InputError(f"the network '{name}' is larger than {MAX_BYTES} bytes; not kept")
+        file.write(chunk)
+        if progress is not None:
+            progress(f"download {name}", done, max(total, done))
+    return done
+
+
+def _unpack(name: str, stored: StoredModel, archive: Path, network: Path) -> None:
+    """Copy the one member out; names inside the archive are never used as paths."""
+    try:
+        with zipfile.ZipFile(archive) as files:
+            members = [
+                info for info in files.infolist() if info.filename.split("/")[-1] == stored.member
+            ]
+            if len(members) != 1 or members[0].file_size > MAX_BYTES:
+                raise InputError(
+                    f"{stored.url}: expected one '{stored.member}' of at most {MAX_BYTES} bytes in "
+                    f"the archive, found {len(members)}: {', '.join(files.namelist()[:8])}"
+                )
+            with files.open(members[0]) as source, network.open("wb") as file:
+                shutil.copyfileobj(source, file, _CHUNK)
+    except (zipfile.BadZipFile, NotImplementedError, EOFError) as error:
+        raise InputError(
+            f"{stored.url}: not a zip archive that can be read ({error}); try again, or give the "
+            f"path of a file instead of '{name}'"
+        ) from None
+
+
+def _by_hand(stored: StoredModel, path: Path) -> str:
+    source = stored.url if stored.member is None else f"{stored.member} of {stored.url}"
+    return f"put {source} at {path} by hand, or give the path of any network file instead"
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _write_record(record: Path, checksum: str) -> None:
+    part = record.with_name(f".{record.name}.{os.getpid()}.part")
+    part.write_text(f"{checksum}\n", encoding="ascii")
+    part.replace(record)

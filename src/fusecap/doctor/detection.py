@@ -1,0 +1,48 @@
+"""Videos without keypoints yet: whether they open, and whether there are networks to read them."""
+
+from __future__ import annotations
+
+from fusecap.detect.detector import DetectorOptions
+from fusecap.detect.model_store import model_path, to_download
+from fusecap.detect.runtimes.network import runtime_for
+from fusecap.doctor.videos import check_videos
+from fusecap.errors import FusecapError
+from fusecap.offline.detect import detector_options
+from fusecap.sources.findings import Findings
+from fusecap.sources.session import Session
+
+
+def check_detection(session: Session, findings: Findings) -> None:
+    """Checks what `fusecap detect` would need."""
+    undetected = {
+        camera.name: camera.video
+        for camera in session.cameras
+        if camera.keypoints is None and camera.video is not None
+    }
+    if not undetected:
+        return
+    if check_videos(undetected, findings):
+        findings.add(
+            "info",
+            "videos",
+            f"{len(undetected)} of {len(session.cameras)} cameras have no keypoints yet: "
+            f"{', '.join(undetected)}",
+            "fusecap detect finds them; fusecap solve does so too",
+        )
+    _check_networks(detector_options(session), findings)
+
+
+def _check_networks(options: DetectorOptions, findings: Findings) -> None:
+    for model in dict.fromkeys((options.model, options.person_model)):
+        try:
+            stored = to_download(model)
+            if stored is not None:
+                findings.add(
+                    "info",
+                    "detector",
+                    f"the network '{model}' is not on this machine yet",
+                    f"fusecap detect downloads it once, from {stored.url}",
+                )
+            runtime_for("x.onnx" if stored else model_path(model), options.runtime)
+        except FusecapError as error:
+            findings.add("error", "detector", str(error))

@@ -1,0 +1,186 @@
+"""A stream: an encoder joined to what carries its packets."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+from fusecap.body.shape import BodyShape
+from fusecap.errors import InputError
+from fusecap.live.target import Target
+from fusecap.live.transports import Counts, LslOutlet, UdpSender, WebSocketServer
+from fusecap.sinks.streams.livelink import livelink_datagrams
+from fusecap.sinks.streams.lsl import lsl_sample
+from fusecap.sinks.streams.osc import osc_datagrams
+from fusecap.sinks.streams.person_pose import StreamFrame
+from fusecap.sinks.streams.rokoko import rokoko_datagrams
+from fusecap.sinks.streams.vmc import PORT_STEP, vmc_datagrams
+from fusecap.sinks.streams.websocket import cast_message, frame_bytes, frame_text
+
+Cast = dict[str, BodyShape]
+"""Everyone a stream is about, in its order."""
+
+
+class Stream(Protocol):
+    """Takes one instant after the other."""
+
+    target: Target
+    counts: Counts
+
+    def send(self, frame: StreamFrame) -> None:
+        """Send one instant; never waits."""
+        ...
+
+    def remark(self) -> str:
+        """What a user should know about the receiving side; empty when all is well."""
+        ...
+
+    def where(self) -> dict[str, str]:
+        """Address per person, where persons have addresses of their own."""
+        ...
+
+    def close(self) -> None: ...
+
+
+def open_stream(target: Target, cast: Cast, rate_hz: float) -> Stream:
+    """A stream to `target`; raises `InputError` where an address cannot be had."""
+    if target.protocol == "vmc":
+        return VmcStream(target, cast)
+    if target.protocol == "ws":
+        return WebSocketStream(target, cast, rate_hz)
+    if target.protocol == "lsl":
+        return LslStream(target, cast, rate_hz)
+    encode: Callable[[StreamFrame], list[bytes]] = {
+        "livelink": livelink_datagrams,
+        "osc": osc_datagrams,
+        "rokoko": lambda frame: rokoko_datagrams(frame, rate_hz),
+    }[target.protocol]
+    return UdpStream(target, encode)
+
+
+class UdpStream:
+    """Everyone to one address."""
+
+    def __init__(self, target: Target, encode: Callable[[StreamFrame], list[bytes]]) -> None:
+        self.target = target
+        self.counts = Counts()
+        self._encode = encode
+        self._sender = UdpSender(target.host, target.port, self.counts)
+
+    def send(self, frame: StreamFrame) -> None:
+        for datagram in self._encode(frame):
+            self._sender.send(datagram)
+
+    def remark(self) -> str:
+        return _udp_remark(self.counts)
+
+    def where(self) -> dict[str, str]:
+        return {}
+
+    def close(self) -> None:
+        self._sender.close()
+
+
+class VmcStream:
+    """Each person to a port of their own."""
+
+    def __init__(self, target: Target, cast: Cast) -> None:
+        self.target = target
+        self.counts = Counts()
+        last = target.port + PORT_STEP * (len(cast) - 1)
+        if last > 65535:
+            raise InputError(
+                f"{target}: {len(cast)} people need ports up to {last}; choose a lower one"
+            )
+        self._ports = {name: target.port + PORT_STEP * i for i, name in enumerate(cast)}
+        self._senders = {
+            name: UdpSender(target.host, port, self.counts) for name, port in self._ports.items()
+        }
+
+    def send(self, frame: StreamFrame) -> None:
+        for name, pose in frame.people.items():
+            for datagram in vmc_datagrams(pose, frame.time_s):
+                self._senders[name].send(datagram)
+
+    def remark(self) -> str:
+        return _udp_remark(self.counts)
+
+    def where(self) -> dict[str, str]:
+        return {
+            name: str(Target(protocol="vmc", host=self.target.host, port=port))
+            for name, port in self._ports.items()
+        }
+
+    def close(self) -> None:
+        for sender in self._senders.values():
+            sender.close()
+
+
+class WebSocketStream:
+    """Everyone to every client."""
+
+    def __init__(self, target: Target, cast: Cast, rate_hz: float) -> None:
+        self.target = target
+        self.counts = Counts()
+        self._server = WebSocketServer(target.host, target.port, self.counts)
+        self._server.publish_cast(cast_message(cast.items(), rate_hz))
+
+    def send(self, frame: StreamFrame) -> None:
+        wants = self._server.wants
+        if wants:
+            self._server.publish(
+                frame_text(frame) if False in wants else None,
+                frame_bytes(frame) if True in wants else None,
+            )
+
+    def remark(self) -> str:
+        if not self._server.clients_ever:
+            return f"no client has connected; open {self.target} or {self.target}/binary"
+        if self.counts.dropped:
+            return "a client is too slow and misses frames"
+        return ""
+
+    def where(self) -> dict[str, str]:
+        return {}
+
+    def close(self) -> None:
+        self._server.close()
+
+
+class LslStream:
+    """One outlet per person."""
+
+    def __init__(self, target: Target, cast: Cast, rate_hz: float) -> None:
+        self.target = target
+        self.counts = Counts()
+        self._cast = cast
+        self._outlets = {
+            name: LslOutlet(name, shape.skeleton, rate_hz, self.counts)
+            for name, shape in cast.items()
+        }
+
+    def send(self, frame: StreamFrame) -> None:
+        for name, pose in frame.people.items():
+            self._outlets[name].send(lsl_sample(pose, self._cast[name].skeleton))
+
+    def remark(self) -> str:
+        if any(outlet.heard for outlet in self._outlets.values()):
+            return ""
+        return "nobody has subscribed; look for streams of type MoCap"
+
+    def where(self) -> dict[str, str]:
+        return {name: f"lsl stream 'fusecap {name}'" for name in self._outlets}
+
+    def close(self) -> None:
+        for outlet in self._outlets.values():
+            outlet.close()
+
+
+def _udp_remark(counts: Counts) -> str:
+    if counts.failed:
+        return f"{counts.failed} packets could not be sent: {counts.last_failure}"
+    if 2 * counts.refused > counts.sent:
+        return "nobody listens there; start the receiver, check its port and the firewall"
+    if counts.dropped:
+        return "packets were dropped before they left this machine; its network is too slow"
+    return ""
