@@ -31,9 +31,10 @@ from fusecap.calibrate.cameras.people_gauge import align, motions
 from fusecap.evaluate.demo_scene import demo_scene
 from fusecap.evaluate.rig_noise import RigNoise, believed
 from fusecap.evaluate.score import score_take
-from fusecap.evaluate.simulated_session import calibration_toml, write_session
+from fusecap.evaluate.simulated_session import write_session
 from fusecap.geometry.camera import Rig
 from fusecap.offline.solve import solve_session
+from fusecap.sources.calibration_files import aniposelib
 from fusecap.sources.session_data import SessionData
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
@@ -43,7 +44,8 @@ def simulated(seeds: int, deg: float, cm: float, seconds: float) -> None:
     print(f"simulated; {deg:g} deg and {cm:g} cm per axis and camera, {seconds:g} s")
     print(
         "seed  held-out px        centre mm (world) before after   deg before after   "
-        "shape mm deg   joints mm rough refined true   aligned mm rough refined true   s"
+        "shape mm deg   joints mm rough refined true   aligned mm rough refined true   "
+        "floor mm deg: rough, refined   s"
     )
     for seed in range(seeds):
         scene = demo_scene(seed, seconds=seconds)
@@ -56,7 +58,7 @@ def simulated(seeds: int, deg: float, cm: float, seconds: float) -> None:
             # Poses come from cameras alone: the sensors would hide what cameras get wrong.
             text = path.read_text()
             path.write_text("\n".join(b for b in text.split("\n\n") if "subject.imu" not in b))
-            (folder / "calibration.toml").write_text(calibration_toml(rough))
+            (folder / "calibration.toml").write_text(aniposelib.dumps(rough.cameras))
             data = open_session(load_session(path))
         finally:
             shutil.rmtree(folder)
@@ -74,7 +76,8 @@ def simulated(seeds: int, deg: float, cm: float, seconds: float) -> None:
         print(
             f"{seed:4d}  {found.before.median_px:5.1f} -> {found.after.median_px:5.2f}   "
             f"{before[0]:6.1f} {after[0]:6.1f}   {before[1]:5.2f} {after[1]:5.2f}   "
-            f"{shape[0]:5.1f} {shape[1]:5.2f}   {joints}   {aligned}   {elapsed_s:4.1f}",
+            f"{shape[0]:5.1f} {shape[1]:5.2f}   {joints}   {aligned}   {_floor(rough, scene.rig)}, "
+            f"{_floor(found.rig, scene.rig)}   {elapsed_s:4.1f}",
             flush=True,
         )
 
@@ -82,6 +85,14 @@ def simulated(seeds: int, deg: float, cm: float, seconds: float) -> None:
 def _off(rig: Rig, truth: Rig) -> tuple[float, float]:
     shift_m, angle_rad = motions(rig, truth)
     return 1e3 * float(shift_m.mean()), float(np.degrees(angle_rad.mean()))
+
+
+def _floor(rig: Rig, truth: Rig) -> str:
+    """How high y = 0 is above the true floor in the middle of the room, and its tilt."""
+    to_truth = align(rig, truth).similarity
+    up = to_truth.rotation[:, 1]
+    height_m = float(up @ to_truth.translation_m / up[1])
+    return f"{1e3 * height_m:+.0f} {np.degrees(np.arccos(min(up[1], 1.0))):.2f}"
 
 
 def pose2sim(folder: Path, refine: tuple[str, ...]) -> None:

@@ -17,6 +17,7 @@ from fusecap.calibrate.cameras.report import calibrate_rig
 from fusecap.cli import main
 from fusecap.errors import CalibrationError
 from fusecap.geometry.projection_derivatives import PARAMETERS, moved
+from fusecap.geometry.similarity import fitted_similarity
 from fusecap.sources.calibration_files import load_rig
 
 DISTORTED = (-0.2, 0.05, 0.0, 0.0, 0.0)
@@ -348,9 +349,9 @@ def test_a_real_rig_agrees_with_its_reference_calibration(data_dir):
         np.array([c.position_in_world for c in cameras])
         for cameras in (solution.cameras, reference)
     )
-    turn, shift = extrinsics._rigid(ours, theirs)
+    onto = fitted_similarity(ours, theirs)
     size = np.linalg.norm(theirs[:, None] - theirs[None], axis=2).max()
-    assert np.linalg.norm(ours @ turn.T + shift - theirs, axis=1).max() < 0.01 * size
+    assert np.linalg.norm(onto.points(ours) - theirs, axis=1).max() < 0.01 * size
 
     def rms(cameras):
         miss = np.concatenate([v.fitted_px for v in extrinsics.predicted(cameras, views, board)])

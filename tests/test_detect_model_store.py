@@ -16,7 +16,7 @@ import pytest
 
 from fusecap.detect.detector import DEFAULT_MODEL, DEFAULT_PERSON_MODEL
 from fusecap.detect.model_store import MODELS, StoredModel, cache_dir, model_path
-from fusecap.detect.runtimes.network import open_network
+from fusecap.detect.runtimes.choice import open_network
 from fusecap.errors import InputError
 from tiny_networks import constant_network
 
@@ -93,6 +93,17 @@ def store(server: Server, path: str = "/m.zip", **changes) -> dict[str, StoredMo
 
 def left_behind(cache: Path) -> list[str]:
     return sorted(path.name for path in cache.rglob("*") if path.is_file())
+
+
+def test_interrupted_download_leaves_nothing(server, network, tmp_path):
+    server.files["/m.zip"] = zipped(**{"m/end2end.onnx": network})
+
+    def interrupt(*step):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        model_path("tiny", interrupt, models=store(server), cache=tmp_path / "cache")
+    assert left_behind(tmp_path / "cache") == []
 
 
 def test_network_is_downloaded_once_and_runs(server, network, tmp_path):

@@ -10,13 +10,13 @@ import pytest
 
 from fusecap.body.landmarks import LANDMARK_SETS
 from fusecap.detect.build import build_detector
-from fusecap.detect.detector import DetectorOptions
+from fusecap.detect.detector import REVISION, DetectorOptions
 from fusecap.detect.images import IMAGENET_BGR, IMAGENET_RGB, RAW_BGR, letterbox
 from fusecap.detect.one_stage import OneStageDetector
 from fusecap.detect.people import bounds, distinct, similarity, suppressed
 from fusecap.detect.person import PersonDetector
 from fusecap.detect.pose import PoseNetwork, from_heatmaps, from_simcc
-from fusecap.detect.runtimes.network import open_network
+from fusecap.detect.runtimes.choice import open_network
 from fusecap.errors import InputError
 from tiny_networks import constant_network, fails_on_batches, red_blob_network
 
@@ -284,7 +284,7 @@ def test_detector_of_two_networks(tmp_path, runtime):
     np.testing.assert_allclose(
         found[0][0, :, :2], np.tile(start + scale * np.array([50, 150.5]), (26, 1)), atol=1e-4
     )
-    for part in ("pose.onnx sha256:", "rtmdet.onnx sha256:", "every 10"):
+    for part in ("pose.onnx sha256:", "rtmdet.onnx sha256:", "every 10", f"revision {REVISION}"):
         assert part in detector.identity
 
 

@@ -11,7 +11,7 @@ from fusecap.detect.images import GREY
 from fusecap.detect.one_stage import OneStageDetector
 from fusecap.detect.packing import MARGIN_PX, PackedDetector, PackedPersonDetector, plan
 from fusecap.detect.person import PersonDetector
-from fusecap.detect.runtimes.network import open_network
+from fusecap.detect.runtimes.choice import open_network
 from fusecap.errors import InputError
 from tiny_networks import constant_network
 

@@ -21,6 +21,7 @@ from fusecap.calibrate.imus.fit import (
     start,
 )
 from fusecap.calibrate.imus.identify import identify
+from fusecap.calibrate.imus.joint_centres import SeenLandmarks, _Problem, fit_together
 from fusecap.calibrate.imus.motion import Worn, calibrate_subject, sensor_rotations
 from fusecap.calibrate.imus.reference import reference_motion
 from fusecap.calibrate.imus.speeds import lag_s
@@ -284,6 +285,91 @@ def test_subject_that_is_hardly_seen_is_refused():
         calibrate_subject(reference_motion(take, 0), [])
 
 
+# Joint centres
+
+
+ARM = ("spine3", "left_upper_arm", "left_forearm")
+
+
+@pytest.fixture(scope="module")
+def biased_arm():
+    """An arm whose landmarks are where a detector puts them: always 20 mm off; its sensors err
+    in nothing. Bones of the reference go through the landmarks, as a solve's do."""
+    sequence, take = motion()
+    imus, worn = sensors(NO_IMU_NOISE, ARM)
+    landmarks = landmark_set_named("body25")
+    bones = landmarks.bones(PAPER21)
+    frames = np.arange(0, 600, 5)
+    times_s = frames / 60.0
+    rotation = take.bone_rotation_in_world(0)[frames]
+    offset = landmarks.offsets_m(sequence.shape)
+    offset_seen = offset + 0.02 * np.random.default_rng(5).choice([-1, 1], offset.shape)
+    points = take.bone_position_in_world_m[0][frames][:, bones]
+    points = points + np.einsum("tkij,kj->tki", rotation[:, bones], offset_seen)
+    seen = SeenLandmarks(
+        times_s=times_s,
+        points_in_world_m=points,
+        landmark_bone=np.asarray(bones),
+        landmark_offset_m=offset,
+        joint_offset_m=take.offsets_m[0],
+    )
+    turned = sensor_rotations(worn, times_s)
+    index = [PAPER21.bone(bone) for bone in ARM]
+    joints = [landmarks.landmark_names.index(f"left_{j}") for j in ("shoulder", "elbow", "wrist")]
+    tight = np.broadcast_to(np.eye(3) * 0.01, (len(frames), 3, 3))
+    pairs = [make_pairs(times_s, rotation[:, index[0]], tight, turned[0])]
+    for number, bone in enumerate(index[1:]):
+        true = points[:, joints[number + 1]] - points[:, joints[number]]
+        now = rotation[:, bone] @ [1.0, 0.0, 0.0]
+        axis = np.cross(now, true / np.linalg.norm(true, axis=1, keepdims=True))
+        bent = Rotation.from_rotvec(axis).as_matrix() @ rotation[:, bone]
+        covariance = np.broadcast_to(np.diag([0.3, 0.01, 0.01]), bent.shape)
+        pairs.append(make_pairs(times_s, bent, covariance, turned[number + 1]))
+    return imus, seen, index, turned, pairs, [fit(some) for some in pairs]
+
+
+def direction_deg(found, imus, turned, number):
+    """Mean error of the direction of a bone's length; the sensors' true heading is 0."""
+    spin = Rotation.from_euler("y", found.heading_rad).as_matrix()
+    ours = spin @ turned[number] @ found.bone_from_imu.T @ [1.0, 0.0, 0.0]
+    true = turned[number] @ imus.mounting[number].T @ [1.0, 0.0, 0.0]
+    return np.degrees(np.arccos(np.sum(ours * true, axis=1))).mean()
+
+
+def test_joint_centres_undo_what_constant_distances_of_keypoints_do(biased_arm):
+    imus, seen, index, turned, pairs, alone = biased_arm
+    together = fit_together(PAPER21, seen, index, turned, pairs, alone)
+    before = direction_deg(alone[1], imus, turned, 1)
+    after = direction_deg(together[1], imus, turned, 1)
+    assert before > 3.0 and after < 0.5 * before, (before, after)
+
+
+def test_derivatives_of_landmarks_by_sensors_and_offsets(biased_arm, rng):
+    _, seen, index, turned, _, alone = biased_arm
+    problem = _Problem(PAPER21, seen, index, turned, np.arange(len(seen.times_s)) < 4)
+    mounting = np.array([each.bone_from_imu for each in alone])
+    heading = rng.normal(size=3)
+    offsets = 0.01 * rng.normal(size=problem.size - 12)
+
+    def error(values):
+        own = values[:12].reshape(3, 4)
+        moved = Rotation.from_rotvec(own[:, :3]).as_matrix() @ mounting
+        return problem.residuals(moved, heading + own[:, 3], offsets + values[12:])[0]
+
+    _, jacobian = problem.residuals(mounting, heading, offsets)
+    for column in range(problem.size):
+        step = np.zeros(problem.size)
+        step[column] = 1e-6
+        numeric = (error(step) - error(-step)) / 2e-6
+        assert np.allclose(numeric, jacobian[..., column], atol=1e-7)
+
+
+def test_nobody_seen_leaves_the_fits_as_they_are(biased_arm):
+    _, seen, index, turned, pairs, alone = biased_arm
+    blind = replace(seen, points_in_world_m=np.full_like(seen.points_in_world_m, np.nan))
+    assert fit_together(PAPER21, blind, index, turned, pairs, alone) == alone
+
+
 # T-pose
 
 
@@ -344,6 +430,13 @@ def test_garbled_file_says_what_is_wrong(tmp_path, change, message):
     path = tmp_path / "imu_calibration.toml"
     path.write_text(imu_calibration_toml([ONE], origin="test").replace(*change))
     with pytest.raises(InputError, match=message):
+        read_imu_calibration(path)
+
+
+def test_file_with_two_sensors_on_one_bone_is_refused(tmp_path):
+    path = tmp_path / "imu_calibration.toml"
+    path.write_text(imu_calibration_toml([ONE, ONE], origin="test"))
+    with pytest.raises(InputError, match=r"'head' of 'an na' has two"):
         read_imu_calibration(path)
 
 
@@ -426,6 +519,9 @@ def test_misuse_and_missing_inputs_are_told(recording, tmp_path, monkeypatch, ca
     path.write_text(bare)
     code, said = run(monkeypatch, capsys, path)
     assert code == 1 and "there are no cameras" in said.err
+    path.write_text(text.replace('bone = "right_shank"', 'bone = "left_shank"'))
+    code, said = run(monkeypatch, capsys, path, "--take", recording / "truth.npz")
+    assert code == 1 and "two [[subject.imu]] on left_shank" in said.err
     path.write_text(text.split("[[subject.imu]]")[0])
     code, said = run(monkeypatch, capsys, path)
     assert code == 1 and "nothing to calibrate" in said.err

@@ -14,14 +14,15 @@ from fusecap.calibrate.sync.cameras import synchronise_cameras
 from fusecap.calibrate.sync.curves import clustered_covariance
 from fusecap.calibrate.sync.imus import Filmed, Worn, imu_clock
 from fusecap.calibrate.sync.session import synchronise
-from fusecap.calibrate.sync.signals import smoothed, view_of
+from fusecap.calibrate.sync.signals import common_smooth_s, smoothed, view_of
 from fusecap.calibrate.sync.stamp import find_stamp
 from fusecap.cli import main
 from fusecap.errors import InputError
 from fusecap.evaluate.demo_scene import demo_scene
 from fusecap.evaluate.simulated_session import write_session
+from fusecap.sources.imu_files import ImuTrack
 from fusecap.sources.keypoint_files import KeypointTrack
-from fusecap.sources.session import load_session, parse_session
+from fusecap.sources.session import SubjectSettings, load_session, parse_session
 from fusecap.sources.session_data import open_session
 from fusecap.sources.sync_files import Clock, Clocks, read_sync, sync_toml
 from session_files import edit, ring, walking_landmarks
@@ -107,6 +108,7 @@ def test_errors_that_are_alike_count_once():
 # Cameras
 
 
+@pytest.mark.slow
 def test_cameras_of_different_rates_and_starts_are_found():
     rig, true_s = ring(3), np.array([0.0, 0.7312, -1.4071])
     found = clocks_of(rig, tracks(rig, walking, true_s, [30, 25, 50]))
@@ -114,6 +116,7 @@ def test_cameras_of_different_rates_and_starts_are_found():
     assert np.all(np.abs(found.offset_s - true_s)[1:] < 4 * found.error_s[1:])
 
 
+@pytest.mark.slow
 def test_variable_frame_times_are_used_as_they_are():
     rig, true_s = ring(3), np.array([0.0, 0.5, 0.0])
     some = tracks(rig, walking, true_s, [30, 30, 30])
@@ -125,6 +128,16 @@ def test_variable_frame_times_are_used_as_they_are():
         people=tuple(some[1].people[i] for i in kept),
     )
     assert clocks_of(rig, some).offset_s[1] == pytest.approx(0.5, abs=0.006)
+
+
+@pytest.mark.slow
+def test_cameras_of_ten_frames_a_second_are_found():
+    rig, true_s = ring(3), np.array([0.0, 0.43, -0.81])
+    some = tracks(rig, walking, true_s, [10, 10, 10], 12.0)
+    smooth_s = common_smooth_s(some)
+    views = [view_of(t, c, smooth_s) for t, c in zip(some, rig.cameras, strict=True)]
+    found = synchronise_cameras(rig, views, BODY25.landmark_names, max_offset_s=2.0)
+    assert np.abs(found.offset_s - true_s).max() < 0.015
 
 
 def test_without_calibration_offsets_are_good_to_a_few_frames():
@@ -187,6 +200,108 @@ def test_sensor_at_rest_tells_nothing():
     assert np.isnan(imu_clock([still], filmed, max_offset_s=3.0).offset_s)
 
 
+def several_clocks(offsets_s):
+    """A subject whose sensors, a file each, are on clocks of their own; person and clocks found."""
+    at, times_s = zip(*(turning(seed) for seed in range(len(offsets_s))), strict=True)
+    bones = ("left_shank", "right_shank", "left_forearm", "right_forearm")[: len(at)]
+    person = Filmed(
+        name="anna",
+        times_s=times_s[0],
+        bone_names=bones,
+        rotation=np.stack([a(t) for a, t in zip(at, times_s, strict=True)], axis=1),
+    )
+    subject = SubjectSettings.model_validate(
+        {"name": "anna", "imu": [{"bone": b, "file": f"{b}.csv"} for b in bones]}
+    )
+    own_s = np.arange(0, 10, 0.01)
+    sensors = [
+        Worn(bone=b, times_s=own_s, rotation=a(own_s + o))
+        for a, b, o in zip(at, bones, offsets_s, strict=True)
+    ]
+    return subject, sensors, person
+
+
+def plain_track(times_s):
+    return ImuTrack(
+        times_s=times_s,
+        orientation_wxyz=np.tile([1.0, 0, 0, 0], (len(times_s), 1)),
+        accel_m_s2=np.zeros((len(times_s), 3)),
+    )
+
+
+def test_sensors_of_one_subject_may_be_on_different_clocks():
+    offsets_s = [0.5, 0.5, 1.3, 1.3]
+    subject, sensors, person = several_clocks(offsets_s)
+    tracks = [plain_track(worn.times_s) for worn in sensors]
+    found = sync_session._subject_clocks(subject, tracks, sensors, person, 3.0, None)
+    assert sorted(len(clock.bones) for clock in found) == [2, 2]
+    by_bone = {bone: clock.offset_s for clock in found for bone in clock.bones}
+    for worn, offset_s in zip(sensors, offsets_s, strict=True):
+        assert by_bone[worn.bone] == pytest.approx(offset_s, abs=0.001)
+
+
+def test_sensors_are_given_to_the_people_they_fit(tmp_path):
+    people, subjects, worn = [], [], []
+    for index, name in enumerate(("anna", "ben")):
+        at, times_s = turning(seed=10 + index)
+        people.append(
+            Filmed(
+                # The video has the names the other way round.
+                name=("ben", "anna")[index],
+                times_s=times_s,
+                bone_names=("left_shank",),
+                rotation=at(times_s)[:, None],
+            )
+        )
+        subjects.append(
+            SubjectSettings.model_validate(
+                {"name": name, "imu": [{"bone": "left_shank", "file": "a.csv"}]}
+            )
+        )
+        own_s = np.arange(0, 10, 0.01)
+        worn.append([Worn(bone="left_shank", times_s=own_s, rotation=at(own_s + 0.4))])
+    session = parse_session(write_small(tmp_path, frames=10))
+    session = session.model_copy(update={"subjects": tuple(subjects)})
+    starts_m = {"ben": (0.5, 0.5), "anna": (-1.0, 0.0)}
+    notes: list[str] = []
+    found = sync_session._wearers(session, subjects, worn, people, starts_m, 2.0, notes)
+    assert [person and person.name for person in found] == ["ben", "anna"]
+    assert len(notes) == 2 and "add start_m = [0.5, 0.5] to 'anna'" in notes[0]
+
+
+def test_drift_of_a_sensor_is_found_in_two_minutes():
+    at, times_s = turning(seconds=130.0)
+    rng = np.random.default_rng(3)
+    noise = Rotation.from_rotvec(0.02 * rng.standard_normal((len(times_s), 3))).as_matrix()
+    filmed = Filmed(
+        name="anna",
+        times_s=times_s,
+        bone_names=("left_shank",),
+        rotation=(at(times_s) @ noise)[:, None],
+    )
+    own_s = np.arange(0, 128, 0.01)
+    worn = Worn(bone="left_shank", times_s=own_s, rotation=at(own_s * (1 + 80e-6) + 0.3))
+    found = imu_clock([worn], filmed, max_offset_s=1.0)
+    assert found.drift_ppm == pytest.approx(80, abs=4 * found.drift_error_ppm)
+    assert found.drift_error_ppm < 15
+
+
+def test_a_limbs_turn_about_itself_does_not_count():
+    at, times_s = turning(seed=4)
+    angles = Rotation.from_matrix(at(times_s)).as_euler("ZXY")
+    late = Rotation.from_matrix(at(times_s - 0.03)).as_euler("ZXY")
+    guessed = np.column_stack([angles[:, :2], late[:, 2]])
+    bone = Rotation.from_euler("ZXY", guessed).as_matrix()
+
+    def offset_s(name):
+        filmed = Filmed(name="a", times_s=times_s, bone_names=(name,), rotation=bone[:, None])
+        worn = Worn(bone=name, times_s=times_s, rotation=at(times_s))
+        return imu_clock([worn], filmed, max_offset_s=1.0).offset_s
+
+    # Along a shank lies y, whose turn alone is 30 ms late here.
+    assert abs(offset_s("left_shank")) < 0.002
+
+
 def test_foot_stamp_is_one_event_on_both_clocks():
     times_s = np.arange(0, 6, 1 / 60)
     height = 0.1 + np.interp(times_s, [0, 2.5, 2.9, 3.0, 6], [0.0, 0.0, 0.3, 0.0, 0.0])
@@ -209,6 +324,7 @@ def small(tmp_path):
     return write_small(tmp_path, frames=120)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("motion", "verdict", "said"),
     [
@@ -226,6 +342,7 @@ def test_motion_that_cannot_tell_is_refused(small, monkeypatch, motion, verdict,
     assert all(name == found.reference for name in found.clocks.cameras)
 
 
+@pytest.mark.slow
 def test_offset_beyond_the_range_is_not_made_up(small, monkeypatch):
     some = tracks(ring(4), walking, [0, 0, 0, 2.0], [30] * 4)
     monkeypatch.setattr(sync_session, "open_keypoints", lambda *_: tuple(some))
@@ -233,6 +350,7 @@ def test_offset_beyond_the_range_is_not_made_up(small, monkeypatch):
     assert row.verdict == "not found" and "--max-offset" in row.said
 
 
+@pytest.mark.slow
 def test_camera_that_sees_nobody_is_named(small, monkeypatch):
     some = tracks(ring(4), walking, np.zeros(4), [30] * 4)
     some[2] = replace(some[2], people=tuple(p[:0] for p in some[2].people))
@@ -240,6 +358,15 @@ def test_camera_that_sees_nobody_is_named(small, monkeypatch):
     rows = synchronise(parse_session(small), max_offset_s=1.0).rows
     assert "nobody is seen" in rows[2].said
     assert rows[1].verdict in ("good", "fair") and rows[3].verdict in ("good", "fair")
+
+
+def test_two_sensors_on_one_bone_are_refused_with_words(tmp_path):
+    path = write_small(tmp_path, frames=10)
+    twice = {"name": "anna", "imu": [{"bone": "head", "file": "a.csv"}] * 2}
+    subject = SubjectSettings.model_validate(twice)
+    session = parse_session(path).model_copy(update={"subjects": (subject,)})
+    with pytest.raises(InputError, match="2 sensors on 'head', expected one per bone"):
+        synchronise(session)
 
 
 def test_one_camera_without_sensors_has_nothing_to_compare(tmp_path):
@@ -313,7 +440,7 @@ def test_command_finds_cameras_and_sensors_of_the_simulated_demo(tmp_path, monke
     report = json.loads(capsys.readouterr().out)
     for row, true in zip(report["clocks"], [*true_s, 0.6, 0.6], strict=True):
         # Flesh carries the sensors late by some 7 ms in the simulation.
-        limit_s = 0.006 if row["kind"] == "camera" else 0.020
+        limit_s = 0.006 if row["kind"] == "camera" else 0.015
         assert row["offset_s"] == pytest.approx(true, abs=limit_s)
     assert (tmp_path / "sync.png").stat().st_size > 10_000
     times_s = [track.times_s[0] for track in open_session(load_session(tmp_path)).keypoints]

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -89,6 +91,37 @@ def test_no_frame_reaches_further_than_half_a_period():
     assert len(people_at(still, 0.549)) == 1 and len(people_at(still, 0.551)) == 0
 
 
+def frozen(rate_hz, gap_s):
+    """A second of one person, a gap without a frame number missing, and another second."""
+    count = round(rate_hz)
+    times_s = np.arange(2 * count) / rate_hz
+    times_s[count:] += gap_s - 1 / rate_hz
+    moving = track([[person(10 + i)] for i in range(2 * count)], rate_hz=rate_hz)
+    return replace(moving, times_s=times_s), times_s[count - 1] + gap_s / 2
+
+
+@pytest.mark.parametrize("rate_hz", [10.0, 30.0, 60.0])
+def test_freeze_of_a_video_is_not_bridged(rate_hz):
+    for gap_s in (0.3, 1.0):
+        moving, t_s = frozen(rate_hz, gap_s)
+        assert len(people_at(moving, t_s)) == 0
+        last_s = t_s - gap_s / 2
+        assert len(people_at(moving, last_s + 0.4 / rate_hz)) == 1
+        assert people_at(moving, t_s + gap_s / 2 - 0.4 / rate_hz) is moving.people[round(rate_hz)]
+
+
+@pytest.mark.parametrize(("rate_hz", "gap_s"), [(60.0, 0.09), (10.0, 0.2), (5.0, 0.4)])
+def test_gaps_of_a_few_frames_are_bridged(rate_hz, gap_s):
+    moving, t_s = frozen(rate_hz, gap_s)
+    assert people_at(moving, t_s)[0, 0, 0] == pytest.approx(9.5 + rate_hz)
+
+
+def test_camera_of_ten_frames_a_second_is_interpolated_throughout():
+    moving = track([[person(10 + i)] for i in range(100)], rate_hz=10.0)
+    for t_s in np.arange(0.05, 9.85, 0.1):
+        assert people_at(moving, t_s)[0, 0, 0] == pytest.approx(10 + 10 * t_s)
+
+
 @given(st.floats(0, 0.4), st.floats(-200, 200))
 def test_constant_velocity_is_reproduced(t_s, velocity):
     moving = track([[person(500 + velocity * 0.1 * frame)] for frame in range(5)])
@@ -152,7 +185,7 @@ def test_single_sample_serves_its_own_instant():
 @given(st.integers(0, 10_000))
 def test_bone_orientation_and_acceleration_are_recovered(seed):
     rng = np.random.default_rng(seed)
-    world_from_bone, mount = (Rotation.random(random_state=rng) for _ in range(2))
+    world_from_bone, mount = (Rotation.random(rng=rng) for _ in range(2))
     heading_deg, up = float(rng.uniform(-180, 180)), rng.choice(["y", "z"])
     accel_in_world = rng.normal(size=3)
     upright = Y_UP_FROM_Z_UP if up == "z" else np.eye(3)

@@ -9,20 +9,20 @@ from scipy.spatial.transform import Rotation
 
 from fusecap.calibrate.cameras.board import Board, BoardView
 from fusecap.calibrate.cameras.board_drawing import board_toml, draw_png, page_for
+from fusecap.calibrate.cameras.resting_imu import resting_imu
 from fusecap.calibrate.cameras.world_frame import (
-    Similarity,
     from_board,
     from_floor_points,
     from_gravity,
     from_points,
     known_length,
-    resting_imu,
     to_north,
     to_reference,
 )
 from fusecap.cli import main
 from fusecap.errors import CalibrationError, InputError
 from fusecap.geometry.camera import Rig
+from fusecap.geometry.similarity import Similarity
 from fusecap.sources.calibration_files import load_rig, write_rig
 from fusecap.sources.imu_files import ImuTrack
 from fusecap.sources.marked_points import MarkedPoints, read_marked_points

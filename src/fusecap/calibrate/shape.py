@@ -22,7 +22,6 @@ of it on simulated bodies is in docs/body_shape.md.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -45,6 +44,7 @@ from fusecap.offline.solve import Progress, solve_instants
 from fusecap.scene import Instants, Scene
 from fusecap.sinks.take import Take
 from fusecap.solve.estimator import SubjectModel
+from fusecap.sources.toml_text import quoted
 
 ROUNDS = 2
 LENGTH_SIGMA = 0.04
@@ -321,38 +321,48 @@ class _Problem:
             weight = np.where(self._seen, np.minimum(1.0, robust), 0.0)
         return solution[: self._count], covariance[: self._count, : self._count]
 
-    def _designed(self, rotation: np.ndarray) -> np.ndarray:
-        """(T, K, 3, size): derivative of each landmark by all unknowns, without the root."""
+    def _designed(self, rotation: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Per landmark its unknowns and its derivative by them (T, 3, m), without the root."""
         skeleton = self._skeleton
         shape = BodyShape.from_height(skeleton, 1.75)
         direction = shape.offsets_m[1:] / np.linalg.norm(shape.offsets_m[1:], axis=1)[:, None]
-        bones = self._landmarks.bones(skeleton)
-        design = np.zeros((*self._seen.shape, 3, self._size))
-        for k, bone in enumerate(bones):
-            at = int(bone)
+        design = []
+        for k, bone in enumerate(self._landmarks.bones(skeleton)):
+            chain, at = [], int(bone)
             while at > 0:
-                parent = skeleton.parents[at]
-                design[:, k, :, at - 1] = rotation[:, parent] @ direction[at - 1]
-                at = parent
-            first = self._count + 3 * k
-            design[:, k, :, first : first + 3] = rotation[:, bone]
+                chain.append(at)
+                at = skeleton.parents[at]
+            along = [rotation[:, skeleton.parents[at]] @ direction[at - 1] for at in chain]
+            own = self._count + 3 * k
+            columns = np.array([*(at - 1 for at in chain), own, own + 1, own + 2])
+            parts = [np.stack(along, axis=2)] if along else []
+            design.append((columns, np.concatenate([*parts, rotation[:, bone]], axis=2)))
         return design
 
-    def _centred(self, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-        """`values` (T, K, 3, ...) less their weighted mean over the landmarks of an instant."""
-        spread = weight.reshape(*weight.shape, *[1] * (values.ndim - 2))
-        total = np.maximum(spread.sum(axis=1, keepdims=True), 1e-12)
-        return values - (spread * values).sum(axis=1, keepdims=True) / total
-
     def _normal(self, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        design = self._centred(self._design, weight)
-        points = self._centred(self._points, weight)
-        weighted = (design * weight[:, :, None, None]).reshape(-1, self._size)
-        return weighted.T @ design.reshape(-1, self._size), weighted.T @ points.reshape(-1)
+        """Of what each landmark is from the weighted mean of its instant: the root drops out."""
+        total = np.maximum(weight.sum(axis=1), 1e-12)[:, None, None]
+        normal, right = np.zeros((self._size, self._size)), np.zeros(self._size)
+        mean = np.zeros((len(weight), 3, self._size))
+        for k, (columns, design) in enumerate(self._design):
+            weighted = design * weight[:, k, None, None]
+            flat = weighted.reshape(-1, len(columns))
+            normal[np.ix_(columns, columns)] += flat.T @ design.reshape(-1, len(columns))
+            right[columns] += flat.T @ self._points[:, k].reshape(-1)
+            mean[:, :, columns] += weighted
+        middle = (weight[:, :, None] * self._points).sum(axis=1)
+        share = (mean / total).reshape(-1, self._size)
+        normal -= share.T @ mean.reshape(-1, self._size)
+        return normal, right - share.T @ middle.reshape(-1)
 
     def _residual(self, solution: np.ndarray, weight: np.ndarray) -> np.ndarray:
-        away = self._points - self._design @ solution
-        return self._centred(away, weight) * self._seen[:, :, None]
+        """(T, K, 3), from the weighted mean of the instant; 0 where missing."""
+        away = self._points.copy()
+        for k, (columns, design) in enumerate(self._design):
+            away[:, k] -= design @ solution[columns]
+        total = np.maximum(weight.sum(axis=1), 1e-12)[:, None, None]
+        away -= (weight[:, :, None] * away).sum(axis=1, keepdims=True) / total
+        return away * self._seen[:, :, None]
 
     def _prior(self, height_m: float, symmetric: bool) -> tuple[np.ndarray, np.ndarray]:
         """Mean and precision of all unknowns."""
@@ -377,7 +387,7 @@ def shape_toml(bodies: Sequence[MeasuredBody], *, origin: str) -> str:
     """[[subject]] tables for a session file; `origin` says where the lengths are from."""
     lines = [f"# Bone lengths [m] with standard deviations; {origin}."]
     for body in bodies:
-        lines += ["", "[[subject]]", f"name = {json.dumps(body.name, ensure_ascii=False)}"]
+        lines += ["", "[[subject]]", f"name = {quoted(body.name)}"]
         how = "stated" if body.height_stated else f"+- {body.height_sigma_m:.3f}, from bone lengths"
         lines.append(f"height_m = {body.height_m:.3f}  # {how}")
         if body.lengths_m:

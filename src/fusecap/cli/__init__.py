@@ -46,7 +46,10 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-calibrate = typer.Typer(no_args_is_help=True, help="Calibrations: cameras, world, clocks, IMUs, bodies, landmark offsets, prior.")
+calibrate = typer.Typer(
+    no_args_is_help=True,
+    help="Calibrations: cameras, world, clocks, IMUs, bodies, landmark offsets, prior.",
+)
 app.add_typer(calibrate, name="calibrate")
 evaluate = typer.Typer(no_args_is_help=True, help="The paper's tables and figures.")
 app.add_typer(evaluate, name="evaluate")
@@ -75,15 +78,15 @@ app.command(epilog=doctor.EXAMPLE)(doctor.doctor)
 app.command(epilog=init.EXAMPLE)(init.init)
 app.command(epilog=simulate.EXAMPLE)(simulate.simulate)
 app.command(epilog=stream.EXAMPLE)(stream.stream)
-calibrate.command(epilog=calibrate_imu.EXAMPLE)(calibrate_imu.imu)
-calibrate.command(epilog=calibrate_offsets.EXAMPLE)(calibrate_offsets.offsets)
-calibrate.command(epilog=calibrate_prior.EXAMPLE)(calibrate_prior.prior)
-calibrate.command(epilog=calibrate_sync.EXAMPLE)(calibrate_sync.sync)
 calibrate.command(epilog=calibrate_board.EXAMPLE)(calibrate_board.board)
 calibrate.command(epilog=calibrate_intrinsics.EXAMPLE)(calibrate_intrinsics.intrinsics)
 calibrate.command(epilog=calibrate_extrinsics.EXAMPLE)(calibrate_extrinsics.extrinsics)
-calibrate.command(epilog=calibrate_shape.EXAMPLE)(calibrate_shape.shape)
 calibrate.command(epilog=calibrate_world.EXAMPLE)(calibrate_world.world)
+calibrate.command(epilog=calibrate_sync.EXAMPLE)(calibrate_sync.sync)
+calibrate.command(epilog=calibrate_imu.EXAMPLE)(calibrate_imu.imu)
+calibrate.command(epilog=calibrate_shape.EXAMPLE)(calibrate_shape.shape)
+calibrate.command(epilog=calibrate_offsets.EXAMPLE)(calibrate_offsets.offsets)
+calibrate.command(epilog=calibrate_prior.EXAMPLE)(calibrate_prior.prior)
 evaluate_twin.add_to(evaluate)
 evaluate_datasets.add_to(evaluate)
 
@@ -94,8 +97,13 @@ def main() -> None:
         app()
     except FusecapError as error:
         _fail(str(error))
+    except SystemExit as leaving:
+        # Typer turns Ctrl-C into Exit(130) without a word.
+        if isinstance(getattr(leaving.__context__, "__cause__", None), KeyboardInterrupt):
+            _say_interrupted()
+        raise
     except KeyboardInterrupt:
-        err.print("interrupted; nothing was written")
+        _say_interrupted()
         sys.exit(130)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -107,6 +115,12 @@ def main() -> None:
             f"internal error: {type(error).__name__}: {error}. This is a fault of fusecap; "
             "please report it with the output of the same command under FUSECAP_DEBUG=1"
         )
+
+
+def _say_interrupted() -> None:
+    if "--json" in sys.argv:
+        print_json({"error": "interrupted"})
+    err.print("interrupted; no unfinished file was left behind")
 
 
 def _fail(message: str) -> None:

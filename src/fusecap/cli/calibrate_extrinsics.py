@@ -160,13 +160,25 @@ def extrinsics(
     for file in files:
         console.print(f"wrote {file}", soft_wrap=True)
     if origin_frame is None:
-        console.print("the first camera is the world; place it in the room: calibrate world")
+        console.print(
+            "the first camera is the world; place it in the room: fusecap calibrate world "
+            f"{out} --board {board} --floor CAMERA=IMAGE --out world.toml",
+            markup=False,
+            soft_wrap=True,
+        )
 
 
 def _lenses(path: Path, names: list[str]) -> list[Camera]:
+    from fusecap.errors import CalibrationError
     from fusecap.sources.calibration_files import load_rig
 
     rig = load_rig(path)
+    strange = [name for name in names if name not in rig.names]
+    if strange:
+        raise CalibrationError(
+            f"{path}: has no camera '{strange[0]}', only {', '.join(rig.names)}; write "
+            "CAMERA=SOURCE with its names"
+        )
     return [rig[name] for name in names]
 
 

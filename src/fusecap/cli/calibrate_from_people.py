@@ -91,6 +91,10 @@ def _no_nan(value: object) -> object:
     return None if isinstance(value, float) and value != value else value
 
 
+def _change(before: float, after: float) -> str:
+    return f"{before:.1f} -> {after:.1f}"
+
+
 def _print_report(found: PeopleCalibration) -> None:
     from rich.table import Table
 
@@ -101,32 +105,33 @@ def _print_report(found: PeopleCalibration) -> None:
         soft_wrap=True,
     )
     table = Table(
-        "camera", "held-out px: median", "90 %", "skeleton", "moved mm", "deg", "known to mm", "deg"
+        *("camera", "median px", "90 % px", "skeleton px", "moved mm, deg", "known mm, deg"),
+        box=None,
+        padding=(0, 2, 0, 0),
     )
-    for column in table.columns:
-        column.no_wrap = True
     for column in table.columns[1:]:
         column.justify = "right"
     for c in found.cameras:
         table.add_row(
             c.name,
-            f"{c.before.median_px:.1f} -> {c.after.median_px:.1f}",
-            f"{c.before.p90_px:.1f} -> {c.after.p90_px:.1f}",
-            f"{c.skeleton_before_px:.1f} -> {c.skeleton_after_px:.1f}",
-            f"{c.moved_mm:.0f}",
-            f"{c.turned_deg:.2f}",
-            f"{c.repeat_mm:.0f} ({c.sigma_mm:.0f})",
-            f"{c.repeat_deg:.2f} ({c.sigma_deg:.2f})",
+            _change(c.before.median_px, c.after.median_px),
+            _change(c.before.p90_px, c.after.p90_px),
+            _change(c.skeleton_before_px, c.skeleton_after_px),
+            f"{c.moved_mm:.0f}, {c.turned_deg:.2f}",
+            f"{c.repeat_mm:.0f}, {c.repeat_deg:.2f}",
         )
     console.print(table)
     console.print(
-        "  known to: scatter over resampled blocks (from the normal equations)", soft_wrap=True
+        "  before -> after on held-out keypoints, and from the solved skeleton; known to: scatter "
+        "over resampled blocks",
+        soft_wrap=True,
     )
     refined = f"poses and {', '.join(found.refined)}" if found.refined else "poses"
+    feet = f"feet {1e3 * found.feet_m:+.0f} mm from the floor"
     console.print(
         f"  {refined}; scale {found.scale:.4f}, from {found.scale_from}; people walked "
-        f"{found.walked_m[0]:.1f} x {found.walked_m[1]:.1f} m; feet {1e3 * found.feet_m:+.0f} mm "
-        "from the floor",
+        f"{found.walked_m[0]:.1f} x {found.walked_m[1]:.1f} m; "
+        f"{feet if found.feet_m == found.feet_m else 'the keypoints have no heels or toes'}",
         soft_wrap=True,
     )
     if found.refined:

@@ -71,12 +71,18 @@ def imu(
         _report_tpose(calibration.calibrate_from_tpose(loaded), out, as_json)
         return
     with progress(quiet=as_json) as show:
-        motion = load_take(take) if take else calibration.seen_by_cameras(loaded, show)
-    reference = calibration.references(loaded, motion, optical=optical)
-    if identify:
+        data = None if optical else calibration.camera_data(loaded, show)
+        motion = load_take(take) if take else calibration.seen_by_cameras(loaded, data, show)
+        reference = calibration.references(loaded, motion, optical=optical)
+        found = (
+            None
+            if identify
+            else calibration.calibrate_from_motion(loaded, reference, motion, data, show)
+        )
+    if found is None:
         _report_identities(calibration.identify_sensors(loaded, reference), as_json)
-        return
-    _report(calibration.calibrate_from_motion(loaded, reference), out, as_json)
+    else:
+        _report(found, out, as_json)
 
 
 def _report(found: tuple[SubjectCalibration, ...], out: Path, as_json: bool) -> None:

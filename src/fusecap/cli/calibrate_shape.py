@@ -164,3 +164,7 @@ def _print_body(body: MeasuredBody) -> None:
             "data" if bone.told else "stature",
         )
     console.print(table)
+    console.print(
+        "  length: from the joint before to the bone's own; left_shank is the left thigh's",
+        soft_wrap=True,
+    )

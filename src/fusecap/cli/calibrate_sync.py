@@ -81,6 +81,8 @@ def sync(
                 console.print('use it: sync = "..." under \\[session]', soft_wrap=True)
         if write and not named:
             console.print(f"{opened.path.name} names it already", soft_wrap=True)
+        if out is None and found.complete:
+            console.print("nothing is changed yet: --write puts the clocks into the session")
         if plot is not None:
             console.print(f"wrote {plot}", soft_wrap=True)
     if not found.complete:
@@ -127,10 +129,12 @@ def _print_report(found: Synchronisation) -> None:
     )
     if found.cameras is not None and found.cameras.refined:
         before, after = found.cameras.residual_px
-        console.print(
-            f"  views disagree by {before:.1f} -> {after:.1f} px (median, of an image 1920 wide)",
-            soft_wrap=True,
-        )
+        if before == before:
+            console.print(
+                f"  views disagree by {before:.1f} -> {after:.1f} px (median, of an image 1920 "
+                "wide)",
+                soft_wrap=True,
+            )
     for name, stamp in found.stamps.items():
         console.print(
             f"  {name}: foot stamp at {stamp.video_s:.2f} s in the video, {stamp.offset_s:+.3f} s "

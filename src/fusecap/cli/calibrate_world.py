@@ -12,8 +12,10 @@ from fusecap.cli.lengths import length_m, named
 
 if TYPE_CHECKING:
     from fusecap.calibrate.cameras.board import Board, BoardView
-    from fusecap.calibrate.cameras.world_frame import Placement, RestingImu, Similarity
+    from fusecap.calibrate.cameras.resting_imu import RestingImu
+    from fusecap.calibrate.cameras.world_frame import Placement
     from fusecap.geometry.camera import Rig
+    from fusecap.geometry.similarity import Similarity
     from fusecap.sources.findings import Finding
     from fusecap.sources.marked_points import MarkedPoints
 
@@ -191,7 +193,7 @@ def _resting(
     """The IMU at rest, and the camera's name it is fixed to or 'board'."""
     if gravity is None:
         return None, ""
-    from fusecap.calibrate.cameras.world_frame import resting_imu
+    from fusecap.calibrate.cameras.resting_imu import resting_imu
     from fusecap.errors import InputError
     from fusecap.sources.imu_files import read_imu
 
@@ -213,7 +215,8 @@ def _resting(
 
 
 def _known_length(rig: Rig, scale_by: str | None, marked: MarkedPoints | None) -> Similarity:
-    from fusecap.calibrate.cameras.world_frame import Similarity, known_length
+    from fusecap.calibrate.cameras.world_frame import known_length
+    from fusecap.geometry.similarity import Similarity
 
     if scale_by in (None, "board", "points"):
         return Similarity()

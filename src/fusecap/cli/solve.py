@@ -24,7 +24,7 @@ from fusecap.cli.common import (
 from fusecap.errors import InputError
 
 if TYPE_CHECKING:
-    from fusecap.offline.solve import Solved
+    from fusecap.offline.solve import Solved, SolveReport
 
 EXAMPLE = "Example: fusecap solve recordings/duo --export bvh --json > report.json"
 
@@ -65,6 +65,8 @@ def solve(
     with progress(quiet=as_json) as show:
         data = open_session(loaded, show)
         solved = solve_session(data, progress=show)
+    if not solved.take.tracked.any() and not solved.report.interrupted:
+        raise InputError(_nobody(solved.report))
     files = write_take(solved.take, target, exports=formats, unit=unit, picture=picture)
     if as_json:
         detection = {} if detected is None else {"detection": detected.as_json()}
@@ -75,6 +77,15 @@ def solve(
             err.print(f"[yellow]note[/] {note}", soft_wrap=True)
         _print_report(solved)
     finish(solved, files, as_json)
+
+
+def _nobody(report: SolveReport) -> str:
+    return (
+        f"nobody could be followed in {report.instants} instants ({report.duration_s:.2f} s) of "
+        f"{report.cameras} cameras; nothing was written. Two cameras must see a person at once, "
+        "for half a second or more, with calibration and clocks that agree: fusecap doctor "
+        "checks both, fusecap detect --overlay draws whom it finds"
+    )
 
 
 def _formats(text: str | None) -> list[str]:

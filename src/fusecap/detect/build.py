@@ -11,7 +11,8 @@ from fusecap.detect.one_stage import OneStageDetector, is_one_stage
 from fusecap.detect.packing import PackedDetector, PackedPersonDetector
 from fusecap.detect.person import PersonDetector
 from fusecap.detect.pose import PoseNetwork
-from fusecap.detect.runtimes.network import Network, open_network
+from fusecap.detect.runtimes.choice import open_network
+from fusecap.detect.runtimes.network import Network
 from fusecap.detect.top_down import TopDownDetector
 from fusecap.errors import InputError
 

@@ -14,6 +14,12 @@ from fusecap.body.landmarks import LandmarkSet
 DEFAULT_MODEL = "rtmpose-m-halpe26"
 DEFAULT_PERSON_MODEL = "rtmdet-nano-person"
 
+REVISION = 2
+"""Of the way from images to keypoints. Raise it with every change that gives other keypoints for
+the same video: colours of decoded pictures, crops, decoding of outputs, thresholds, who is kept,
+when the person detector runs, where people are expected (`fusecap.offline`). Keypoints of another
+revision are detected anew."""
+
 
 @runtime_checkable
 class Detector(Protocol):
@@ -26,7 +32,7 @@ class Detector(Protocol):
 
     @property
     def identity(self) -> str:
-        """Networks by name and checksum, and the options that change results."""
+        """Networks by name and checksum, the options that change results, and `REVISION`."""
         ...
 
     def detect(

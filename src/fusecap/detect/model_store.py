@@ -30,8 +30,8 @@ from fusecap.errors import InputError, nearest
 Progress = Callable[[str, int, int], None]
 """Called with (what, bytes done, bytes in all)."""
 
-TIMEOUT_S = 30.0
-"""Without a byte from the server."""
+TIMEOUT_S = 10.0
+"""For each address of the server until it answers, and later without a byte from it."""
 MAX_BYTES = 2**31
 """Of one network; no known one has half of it."""
 

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from fusecap.body.landmarks import LandmarkSet
+from fusecap.detect.detector import REVISION
 from fusecap.detect.images import RAW_BGR, letterbox
 from fusecap.detect.people import distinct, within
 from fusecap.detect.person import LEAST_SCORE, canvas_size
@@ -42,8 +43,8 @@ class OneStageDetector:
 
     @property
     def identity(self) -> str:
-        """The network's, and the threshold."""
-        return f"{self._network.identity} score {LEAST_SCORE}"
+        """The network's, the threshold and the revision."""
+        return f"{self._network.identity} score {LEAST_SCORE}; revision {REVISION}"
 
     def canvas_size(self, image_size: tuple[int, int]) -> tuple[int, int]:
         """Width and height of the network's input for an image (w, h)."""

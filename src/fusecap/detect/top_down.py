@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from fusecap.body.landmarks import LandmarkSet
+from fusecap.detect.detector import REVISION
 from fusecap.detect.people import (
     areas,
     bounds,
@@ -97,8 +98,9 @@ class TopDownDetector:
 
     @property
     def identity(self) -> str:
-        """Networks by name and checksum, and the options that change results."""
-        return f"{self._pose.identity}; {self._person.identity}; every {self._person_every}"
+        """Networks by name and checksum, the options that change results, and the revision."""
+        networks = f"{self._pose.identity}; {self._person.identity}"
+        return f"{networks}; every {self._person_every}; revision {REVISION}"
 
     def reset(self) -> None:
         """Forget earlier instants: the next one looks for everyone anew."""
@@ -130,8 +132,6 @@ class TopDownDetector:
             self._until_search = self._person_every
             found = self._person.find(shown)
             boxes = [_refreshed(a, b[:, :4]) for a, b in zip(boxes, found, strict=True)]
-            self._wait = [0] * len(images)
-            self._patience = [1] * len(images)
         self._until_search -= 1
         people = self._poses(shown, boxes)
         if not search:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from fusecap.detect.detector import DetectorOptions
 from fusecap.detect.model_store import model_path, to_download
-from fusecap.detect.runtimes.network import runtime_for
+from fusecap.detect.runtimes.choice import runtime_for
 from fusecap.doctor.videos import check_videos
 from fusecap.errors import FusecapError
 from fusecap.offline.detect import detector_options

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from fusecap.doctor.detection import check_detection
 from fusecap.doctor.folder import PRINT_A_BOARD, check_folder
 from fusecap.doctor.imus import check_imus
@@ -31,6 +33,9 @@ from fusecap.sources.session_data import (
     with_detections,
 )
 from fusecap.sources.sync_files import Clocks
+
+SHORT_S = 0.5
+"""A person is followed for about as long before becoming a subject."""
 
 
 def diagnose(path: Path | str, progress: Progress | None = None) -> list[Finding]:
@@ -63,7 +68,10 @@ def diagnose(path: Path | str, progress: Progress | None = None) -> list[Finding
     )
     if complete and (tracks or imus):
         try:
-            solve_times_s(session, tuple(tracks.values()), [t for t in imus if t is not None])
+            times_s = solve_times_s(
+                session, tuple(tracks.values()), [t for t in imus if t is not None]
+            )
+            _check_length(times_s, findings)
         except FusecapError as error:
             findings.add("error", str(session_file(path).name), str(error).split(": ", 1)[-1])
     check_views(session, rig, tracks, findings)
@@ -111,6 +119,18 @@ def _check_rig(session: Session, findings: Findings) -> Rig | None:
         return None
     findings += odd
     return rig
+
+
+def _check_length(times_s: np.ndarray, findings: Findings) -> None:
+    length_s = float(times_s[-1] - times_s[0])
+    if length_s < SHORT_S:
+        findings.add(
+            "warning",
+            "session",
+            f"lasts {length_s:.2f} s in all",
+            f"people are found once they are followed for {SHORT_S:g} s: record longer, and see "
+            "whether files are whole",
+        )
 
 
 def _check_amount(session: Session, tracks: dict[str, KeypointTrack], findings: Findings) -> None:

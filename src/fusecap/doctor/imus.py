@@ -12,7 +12,7 @@ from fusecap.sources.findings import Findings
 from fusecap.sources.imu_files import read_imu
 from fusecap.sources.imu_files.track import GRAVITY_M_S2, ImuTrack
 from fusecap.sources.session import ImuSettings, Session
-from fusecap.sources.session_data import mount
+from fusecap.sources.session_data import mount, sensor_notes
 from fusecap.sources.sync_files import Clocks
 
 
@@ -21,6 +21,7 @@ def check_imus(session: Session, clocks: Clocks, findings: Findings) -> list[Imu
     tracks: list[ImuTrack | None] = []
     for subject in session.subjects:
         unmounted = []
+        read: list[ImuTrack | None] = []
         for imu in subject.imus:
             where = f"imu '{imu.bone}' of '{subject.name}'"
             track = None
@@ -35,11 +36,13 @@ def check_imus(session: Session, clocks: Clocks, findings: Findings) -> list[Imu
                         mount(subject.model_copy(update={"imus": (imu,)}), [track])
                 except FusecapError as error:
                     findings.add("error", where, str(error).removeprefix(f"{where}: "))
+            read.append(track)
             if track is not None:
                 _check_imu(where, imu, track, findings)
                 times_s = clocks.imu(subject.name, imu.bone).session_s(track.times_s)
                 track = replace(track, times_s=times_s)
             tracks.append(track)
+        findings += sensor_notes(subject, read)
         if unmounted:
             _add_unmounted(subject.name, unmounted, bool(session.cameras), findings)
     return tracks
@@ -56,8 +59,6 @@ def _add_unmounted(subject: str, bones: list[str], cameras: bool, findings: Find
 
 
 def _check_imu(where: str, imu: ImuSettings, track: ImuTrack, findings: Findings) -> None:
-    for note in track.notes:
-        findings.add("warning", where, note)
     if imu.rate_hz is not None and abs(track.rate_hz / imu.rate_hz - 1) > 0.02:
         findings.add(
             "warning",

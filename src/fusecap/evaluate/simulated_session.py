@@ -19,9 +19,10 @@ from fusecap.body.shape import BodyShape
 from fusecap.errors import InputError
 from fusecap.evaluate.imu_noise import SimulatedImus
 from fusecap.evaluate.simulator import Person, Progress, Simulation
-from fusecap.geometry.camera import Rig
 from fusecap.sinks.files import safe_name, written_whole
 from fusecap.sinks.take import save_take
+from fusecap.sources.calibration_files import aniposelib
+from fusecap.sources.toml_text import quoted
 
 
 def write_session(
@@ -36,7 +37,7 @@ def write_session(
     Bone lengths are written where they deviate from the stature's, unless told not to.
     """
     folder = Path(folder)
-    _write(folder / "calibration.toml", calibration_toml(simulation.rig))
+    _write(folder / "calibration.toml", aniposelib.dumps(simulation.rig.cameras))
     for name, view in zip(simulation.rig.names, simulation.views, strict=True):
         for frame, people in enumerate(view.people):
             _write(
@@ -55,29 +56,12 @@ def write_session(
     return path
 
 
-def calibration_toml(rig: Rig) -> str:
-    """The rig in the aniposelib layout, metres."""
-    tables = []
-    for index, camera in enumerate(rig.cameras):
-        rotation = Rotation.from_matrix(camera.rotation).as_rotvec()
-        tables.append(
-            f"[cam_{index}]\n"
-            f"name = {_text(camera.name)}\n"
-            f"size = {list(camera.size_px)}\n"
-            f"matrix = {camera.matrix.tolist()}\n"
-            f"distortions = {camera.distortion.tolist()}\n"
-            f"rotation = {rotation.tolist()}\n"
-            f"translation = {camera.translation.tolist()}\n"
-        )
-    return "\n".join(tables)
-
-
 def _session_toml(simulation: Simulation, bone_lengths: bool) -> str:
     fmt = f"openpose-{simulation.landmark_set.name}"
     head = [
         f"# Simulated; seed {simulation.seed}. The truth is in truth.npz.",
         "[session]",
-        f"name = {_text(simulation.name)}",
+        f"name = {quoted(simulation.name)}",
         f"rate_hz = {simulation.rate_hz!r}",
         *(['calibration = "calibration.toml"'] if len(simulation.rig) else []),
         'up = "y"',
@@ -89,8 +73,8 @@ def _session_toml(simulation: Simulation, bone_lengths: bool) -> str:
     tables = ["\n".join(head) + "\n"]
     tables += [
         "[[camera]]\n"
-        f"name = {_text(name)}\n"
-        f"keypoints = {_text(f'keypoints/{name}')}\n"
+        f"name = {quoted(name)}\n"
+        f"keypoints = {quoted(f'keypoints/{name}')}\n"
         f'format = "{fmt}"\n'
         f"rate_hz = {view.timing.rate_hz!r}\n"
         f"offset_s = {view.timing.offset_s!r}\n"
@@ -113,7 +97,7 @@ def _subject_toml(person: Person, bone_lengths: bool) -> str:
     ]
     return (
         "[[subject]]\n"
-        f"name = {_text(person.name)}\n"
+        f"name = {quoted(person.name)}\n"
         f"height_m = {shape.height_m!r}\n"
         f"start_m = {np.round(person.theta[0, [0, 2]], 2).tolist()}\n"
         + (f"bone_lengths_m = {{ {', '.join(lengths)} }}\n" if lengths else "")
@@ -124,8 +108,8 @@ def _imu_toml(subject: str, imus: SimulatedImus) -> list[str]:
     quaternion = _wxyz(imus.bone_from_imu)
     return [
         "[[subject.imu]]\n"
-        f"bone = {_text(bone)}\n"
-        f"file = {_text(_imu_file(subject, bone))}\n"
+        f"bone = {quoted(bone)}\n"
+        f"file = {quoted(_imu_file(subject, bone))}\n"
         'format = "csv"\n'
         f"bone_from_imu_wxyz = {quaternion[sensor].tolist()}\n"
         f"position_m = {imus.position_in_bone_m[sensor].tolist()}\n"
@@ -163,11 +147,6 @@ def _openpose_json(people: Float[np.ndarray, "n k 3"]) -> str:
 
 def _wxyz(rotation: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 4"]:
     return np.roll(Rotation.from_matrix(rotation).as_quat(canonical=True), 1, axis=1)
-
-
-def _text(value: str) -> str:
-    """A TOML string; JSON's escapes are TOML's."""
-    return json.dumps(value, ensure_ascii=False)
 
 
 def _write(path: Path, text: str) -> None:

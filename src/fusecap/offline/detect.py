@@ -25,17 +25,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Int
 
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.detect.detector import Detector, DetectorOptions
 from fusecap.errors import InputError, SessionError
 from fusecap.offline.expected_people import ExpectedPeople
+from fusecap.offline.read_ahead import read_ahead
 from fusecap.scene import Scene, scene_before
 from fusecap.sinks import openpose
 from fusecap.sinks.files import safe_name
 from fusecap.sources.detection_files import DetectionRecord, mark, read_record
-from fusecap.sources.frame_sets import FramePlan, clock_times_ns, every_frame
-from fusecap.sources.keypoint_files import read_keypoints
+from fusecap.sources.frame_sets import FramePlan, clock_times_ns, every_frame, frame_sets
+from fusecap.sources.keypoint_files import read_keypoints, read_people
 from fusecap.sources.session import Session
 from fusecap.sources.session_data import open_rig
 from fusecap.sources.video import Video
@@ -238,14 +240,56 @@ def _detect(
 ) -> None:
     """Everything that has no file yet, and what comes before it in its block."""
     missing = np.stack([work.misses(plan.frame[:, i]) for i, work in enumerate(works)], axis=1)
-    rows = _rows_to_detect(missing.any(axis=1))
+    rows = _rows_to_detect(np.any(missing, axis=1, keepdims=False))
     shown = plan.frame[rows].copy()
     for index, work in enumerate(works):
         if work.was_complete:
             shown[~missing[rows, index], index] = -1
     total = int((shown >= 0).sum())
-    expected = ExpectedPeople.nobody_yet(scene, works_periods_s := [], landmark_count=0)
     videos = [work.camera.video for work in works]
+    todo = FramePlan(timestamps_ns=plan.timestamps_ns[rows], frame=shown)
+    expected, block = _expected_people(works, detector, scene), -1
+    ahead = read_ahead(frame_sets(videos, todo), _AHEAD)
+    for row, wanted, frames in zip(rows, shown, ahead, strict=True):
+        if row // BLOCK_INSTANTS != block:
+            block = row // BLOCK_INSTANTS
+            detector.reset()
+            expected = _expected_people(works, detector, scene)
+        images = [None if frame is None else frame.image for frame in frames.frames]
+        people: list[np.ndarray | None] = [None] * len(works)
+        if any(image is not None for image in images):
+            people = list(detector.detect(images, expected.at(frames.timestamp_ns)))
+        for index, work in enumerate(works):
+            number = int(plan.frame[row, index])
+            if number < 0:
+                people[index] = None
+            elif wanted[index] < 0:
+                people[index] = read_people(work.frame_path(number), detector.landmarks)
+            else:
+                people[index] = work.keep(number, people[index], images[index] is not None)
+        expected.learn(frames.timestamp_ns, people)
+        if progress is not None:
+            progress("detecting frames", sum(work.looked_at for work in works), total)
+
+
+def _rows_to_detect(missing: Bool[np.ndarray, " n"]) -> Int[np.ndarray, " m"]:
+    """Per block the instants from its first to the last that misses frames."""
+    blocks = [
+        np.arange(start, start + np.flatnonzero(some)[-1] + 1)
+        for start in range(0, len(missing), BLOCK_INSTANTS)
+        if (some := missing[start : start + BLOCK_INSTANTS]).any()
+    ]
+    return np.concatenate([np.empty(0, dtype=np.int64), *blocks])
+
+
+def _expected_people(
+    works: Sequence[_Work], detector: Detector, scene: Scene | None
+) -> ExpectedPeople:
+    return ExpectedPeople(
+        scene,
+        periods_s=[1.0 / work.camera.video.info.rate_hz for work in works],
+        landmark_count=len(detector.landmarks.landmark_names),
+    )
 
 
 class _Work:
@@ -254,6 +298,8 @@ class _Work:
     def __init__(self, camera: CameraVideo, detector: Detector, progress: Progress | None) -> None:
         self.camera = camera
         self.written = 0
+        self.looked_at = 0
+        """Frames, those written included."""
         self._landmark_count = len(detector.landmarks.landmark_names)
         self._undecodable = 0
         report = None
@@ -266,10 +312,10 @@ class _Work:
             times_ns=camera.video.times_ns,
             complete=False,
         )
-        self.done = self._reusable()
-        """(F,) which frames have a file."""
+        self.done, self.was_complete = self._reusable()
+        """(F,) which frames have a file, and whether an earlier run came to its end with them."""
 
-    def _reusable(self) -> np.ndarray:
+    def _reusable(self) -> tuple[np.ndarray, bool]:
         folder, count = self.camera.folder, len(self._record.times_ns)
         before = read_record(folder)
         if before is None and openpose.is_foreign(folder):
@@ -282,27 +328,33 @@ class _Work:
             before = None
         if before is None:
             openpose.write_record(folder, self._record.json())
-            return np.zeros(count, dtype=np.bool_)
+            return np.zeros(count, dtype=np.bool_), False
         there = {path.name for path in folder.iterdir()}
-        return np.array([self.frame_path(number).name in there for number in range(count)])
+        done = np.array([self.frame_path(number).name in there for number in range(count)])
+        return done, before.complete
+
+    def misses(self, numbers: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+        """Which of these frames have no file; -1 is no frame."""
+        return (numbers >= 0) & ~self.done[numbers]
 
     def frame_path(self, number: int) -> Path:
         return openpose.frame_path(self.camera.folder, self.camera.name, number)
 
-    def write(self, number: int, people: np.ndarray | None, decoded: bool) -> np.ndarray:
-        """Writes a frame, that of a picture which cannot be decoded as one without people."""
+    def keep(self, number: int, people: np.ndarray | None, decoded: bool) -> np.ndarray:
+        """Writes a frame that has no file, that of a picture which cannot be decoded as empty."""
         if people is None or not decoded:
             people = np.empty((0, self._landmark_count, 3))
-        self._undecodable += not decoded
-        openpose.write_frame(self.camera.folder, self.camera.name, number, people)
-        self.done[number] = True
-        self.written += 1
+        self.looked_at += 1
+        if not self.done[number]:
+            self._undecodable += not decoded
+            openpose.write_frame(self.camera.folder, self.camera.name, number, people)
+            self.done[number] = True
+            self.written += 1
         return people
 
     def finish(self) -> None:
-        """Marks the folder as complete where it is."""
-        if self.done.all():
-            openpose.write_record(self.camera.folder, replace(self._record, complete=True).json())
+        """Marks the folder as complete."""
+        openpose.write_record(self.camera.folder, replace(self._record, complete=True).json())
 
     def notes(self) -> list[str]:
         notes = list(self.camera.video.notes)

@@ -7,14 +7,14 @@ same order, so results do not depend on it.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
 T = TypeVar("T")
 
 
-def read_ahead(items: Iterable[T], count: int) -> Iterator[T]:
+def read_ahead(items: Iterable[T], count: int) -> Generator[T, None, None]:
     """The items (none of them None), up to `count` of them made ahead by a thread.
 
     What making an item raises is raised where that item is asked for.

@@ -118,7 +118,7 @@ def read_record(folder: Path) -> DetectionRecord | None:
         return None
     try:
         return _record(json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
         raise InputError(
             f"{path}: cannot be read ({type(error).__name__}: {error}); expected the record of a "
             "detection: delete the folder and detect again"
@@ -130,6 +130,9 @@ def _record(data: dict[str, Any]) -> DetectionRecord:
         raise ValueError(f"format is {data['format']!r}, expected {FORMAT!r}")
     video = data["video"]
     width, height = video["size_px"]
+    times_ns = np.array(data["times_ns"], dtype=np.int64)
+    if times_ns.ndim != 1 or (np.diff(times_ns) <= 0).any():
+        raise ValueError("times_ns is not a list of ascending times")
     return DetectionRecord(
         landmark_set=str(data["landmark_set"]),
         detector=str(data["detector"]),
@@ -137,16 +140,16 @@ def _record(data: dict[str, Any]) -> DetectionRecord:
             name=str(video["name"]),
             bytes=int(video["bytes"]),
             sha256=str(video["sha256"]),
-            size_px=(int(width), int(height)),
+            size_px=(int(_positive(width)), int(_positive(height))),
             rate_hz=_positive(video["rate_hz"]),
             variable_rate=bool(video["variable_rate"]),
         ),
-        times_ns=np.array(data["times_ns"], dtype=np.int64),
+        times_ns=times_ns,
         complete=bool(data["complete"]),
     )
 
 
 def _positive(value: Any) -> float:
-    if not float(value) > 0:
-        raise ValueError(f"rate_hz is {value}, expected a number above zero")
+    if not 0 < float(value) < np.inf:
+        raise ValueError(f"{value} where a number above zero is expected")
     return float(value)

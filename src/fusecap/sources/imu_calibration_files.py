@@ -14,7 +14,7 @@ The values come before those of the session's [[subject.imu]] tables.
 
 from __future__ import annotations
 
-import json
+import sys
 import tomllib
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from fusecap.errors import InputError, nearest
+from fusecap.sources.toml_text import quoted
 
 FORMAT = "fusecap imu calibration 1"
 _KEYS = ("format", "origin", "imu")
@@ -44,16 +45,16 @@ def imu_calibration_toml(imus: Iterable[CalibratedImu], *, origin: str) -> str:
     """The text of a file; `origin` says where the values are from."""
     lines = [
         "# How sensors sit on their bones; name this file as imu_calibration under [session].",
-        f"format = {_text(FORMAT)}",
-        f"origin = {_text(origin)}",
+        f"format = {quoted(FORMAT)}",
+        f"origin = {quoted(origin)}",
     ]
     for imu in imus:
         numbers = ", ".join(f"{value:.7f}" for value in imu.bone_from_imu_wxyz)
         lines += [
             "",
             "[[imu]]",
-            f"subject = {_text(imu.subject)}",
-            f"bone = {_text(imu.bone)}",
+            f"subject = {quoted(imu.subject)}",
+            f"bone = {quoted(imu.bone)}",
             f"bone_from_imu_wxyz = [{numbers}]",
             f"heading_deg = {imu.heading_deg:.3f}",
         ]
@@ -78,7 +79,16 @@ def read_imu_calibration(path: Path | str) -> tuple[CalibratedImu, ...]:
     tables = data.get("imu", [])
     if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
         raise InputError(f"{path}: imu is {tables!r}, expected [[imu]] tables")
-    return tuple(_imu(path, number, table) for number, table in enumerate(tables, start=1))
+    imus = tuple(_imu(path, number, table) for number, table in enumerate(tables, start=1))
+    seen = set()
+    for imu in imus:
+        if (imu.subject, imu.bone) in seen:
+            raise InputError(
+                f"{path}: '{imu.bone}' of '{imu.subject}' has two [[imu]] tables, expected one; "
+                "write the file again with: fusecap calibrate imu"
+            )
+        seen.add((imu.subject, imu.bone))
+    return imus
 
 
 def _imu(path: Path, number: int, table: dict[str, Any]) -> CalibratedImu:
@@ -120,9 +130,6 @@ def _numbers(values: Any) -> list[float] | None:
         return None
     if any(isinstance(v, bool) or not isinstance(v, int | float) for v in values):
         return None
-    return [float(v) for v in values] if np.isfinite(values).all() else None
-
-
-def _text(value: str) -> str:
-    """A TOML string; JSON's escapes are TOML's."""
-    return json.dumps(value, ensure_ascii=False)
+    if not all(abs(v) <= sys.float_info.max for v in values):
+        return None
+    return [float(v) for v in values]

@@ -8,7 +8,7 @@ session's rate are not interpolated at all.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -131,16 +131,7 @@ def open_session(session: Session, progress: Progress | None = None) -> SessionD
             replace(track, times_s=clocks.imu(subject.name, imu.bone).session_s(track.times_s))
             for imu, track in zip(subject.imus, open_imus(subject), strict=True)
         ]
-        for imu, track in zip(subject.imus, tracks[subject.name], strict=True):
-            findings += [
-                Finding(
-                    severity="warning",
-                    where=f"imu '{imu.bone}' of '{subject.name}'",
-                    found=note,
-                    remedy="gaps over 0.1 s are not bridged" if "gaps" in note else "",
-                )
-                for note in track.notes
-            ]
+        findings += sensor_notes(subject, tracks[subject.name])
     times_s = solve_times_s(session, keypoints, [t for some in tracks.values() for t in some])
     imus = []
     for subject in session.subjects:
@@ -338,6 +329,35 @@ def _shared_delays_s(tracks: list[ImuTrack]) -> list[float]:
     return delays
 
 
+def sensor_notes(subject: SubjectSettings, tracks: Sequence[ImuTrack | None]) -> list[Finding]:
+    """What was dealt with in a subject's sensor files; None for a file that was not read.
+
+    Lost samples are one finding per subject: radio drops some of nearly every sensor's.
+    """
+    findings, lost = [], []
+    for imu, track in zip(subject.imus, tracks, strict=True):
+        for note in () if track is None else track.notes:
+            if "samples lost" in note:
+                lost.append((imu.bone, note))
+            else:
+                where = f"imu '{imu.bone}' of '{subject.name}'"
+                findings.append(Finding(severity="warning", where=where, found=note, remedy=""))
+    if lost:
+        each = ", ".join(f"{bone} {note.replace(' samples lost', '')}" for bone, note in lost)
+        alone = len(lost) == 1
+        findings.append(
+            Finding(
+                severity="warning",
+                where=f"imu '{lost[0][0]}' of '{subject.name}'"
+                if alone
+                else f"sensors of '{subject.name}'",
+                found=lost[0][1] if alone else f"samples lost: {each}",
+                remedy="gaps over 0.1 s are not bridged",
+            )
+        )
+    return findings
+
+
 def mount(subject: SubjectSettings, tracks: list[ImuTrack]) -> list[MountedImu]:
     """Sensors with their offsets; `bone_from_imu` from the T-pose where it is not given."""
     return [
@@ -359,9 +379,9 @@ def _bone_from_imu(subject: SubjectSettings, imu: ImuSettings, track: ImuTrack) 
         return Rotation.from_quat([x, y, z, w]).as_matrix()
     if subject.tpose_s is None:
         raise SessionError(
-            f"{where}: neither bone_from_imu_wxyz nor the subject's tpose_s is given; give the "
-            "interval in which the subject stands in the rest pose, or [1, 0, 0, 0] for a sensor "
-            "whose axes are the bone's"
+            f"{where}: how it sits on the bone is not known; fusecap calibrate imu finds it from "
+            "motion the cameras saw, tpose_s states when the subject stands in the T-pose, "
+            "bone_from_imu_wxyz = [1, 0, 0, 0] a sensor whose axes are the bone's"
         )
     start_s, end_s = subject.tpose_s
     inside = (track.times_s >= start_s) & (track.times_s <= end_s)

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from fusecap.body.skeleton import Skeleton, skeleton_named
 from fusecap.errors import InputError
 from fusecap.sources.folder_survey import FolderSurvey, FoundSensor
+from fusecap.sources.toml_text import quoted
 
 SKELETON = "paper21"
 
@@ -18,9 +19,9 @@ def draft(found: FolderSurvey) -> str:
             f"{found.folder}: no video, no keypoint folder and no sensor file; put the recording "
             "into this folder"
         )
-    lines = ["[session]", f"name = {_quoted(found.folder.resolve().name)}"]
+    lines = ["[session]", f"name = {quoted(found.folder.resolve().name)}"]
     if found.calibration is not None:
-        lines.append(f"calibration = {_quoted(found.calibration.as_posix())}")
+        lines.append(f"calibration = {quoted(found.calibration.as_posix())}")
         if found.calibration.name.endswith((".qca.txt", ".qca")):
             lines.append('up = "z"   # as Qualisys has it')
     elif found.videos or found.keypoints:
@@ -36,10 +37,10 @@ def _cameras(found: FolderSurvey) -> Iterator[str]:
     sources |= {name: ("keypoints", path) for name, path in found.keypoints.items()}
     for name in sorted(sources):
         key, path = sources[name]
-        yield from ("", "[[camera]]", f"name = {_quoted(name)}")
-        yield f"{key} = {_quoted(path.as_posix())}"
+        yield from ("", "[[camera]]", f"name = {quoted(name)}")
+        yield f"{key} = {quoted(path.as_posix())}"
         if key == "keypoints" and found.keypoint_format:
-            yield f"format = {_quoted(found.keypoint_format)}"
+            yield f"format = {quoted(found.keypoint_format)}"
         if found.cameras and name not in found.cameras:
             yield f"# the calibration has no camera of this name, only: {', '.join(found.cameras)}"
 
@@ -55,19 +56,14 @@ def _subject(found: FolderSurvey) -> Iterator[str]:
         known = _usable(sensor, skeleton, taken)
         mark = "" if known else "# "
         yield from ("", f"{mark}[[subject.imu]]")
-        yield f"{mark}bone = {_quoted(sensor.bone or 'which?')}"
-        yield f"{mark}file = {_quoted(sensor.file.as_posix())}"
-        yield f"{mark}format = {_quoted(sensor.format)}"
+        yield f"{mark}bone = {quoted(sensor.bone or 'which?')}"
+        yield f"{mark}file = {quoted(sensor.file.as_posix())}"
+        yield f"{mark}format = {quoted(sensor.format)}"
         if sensor.sensor is not None:
-            yield f"{mark}sensor = {_quoted(sensor.sensor)}"
+            yield f"{mark}sensor = {quoted(sensor.sensor)}"
         if known:
             taken.add(str(sensor.bone))
 
 
 def _usable(sensor: FoundSensor, skeleton: Skeleton, taken: set[str]) -> bool:
     return sensor.bone in skeleton.bone_names and sensor.bone not in taken
-
-
-def _quoted(text: str) -> str:
-    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
-    return f'"{escaped}"'

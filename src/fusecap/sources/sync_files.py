@@ -14,8 +14,7 @@ offset_s = -1.25000
 
 from __future__ import annotations
 
-import json
-import math
+import sys
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -25,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from fusecap.errors import InputError, nearest
+from fusecap.sources.toml_text import quoted
 
 FORMAT = "fusecap sync 1"
 MAX_DRIFT_PPM = 10_000.0
@@ -68,14 +68,14 @@ def sync_toml(clocks: Clocks, *, origin: str) -> str:
     """The text of a file; `origin` says how the clocks came about."""
     lines = [
         "# session time = own time * (1 + drift_ppm / 1e6) + offset_s",
-        f"format = {_text(FORMAT)}",
-        f"origin = {_text(origin)}",
+        f"format = {quoted(FORMAT)}",
+        f"origin = {quoted(origin)}",
     ]
     for name, clock in clocks.cameras.items():
-        lines += ["", f"[camera.{_text(name)}]", *_rows(clock)]
+        lines += ["", f"[camera.{quoted(name)}]", *_rows(clock)]
     for subject, sensors in clocks.imus.items():
         for bone, clock in sensors.items():
-            lines += ["", f"[subject.{_text(subject)}.{_text(bone)}]", *_rows(clock)]
+            lines += ["", f"[subject.{quoted(subject)}.{quoted(bone)}]", *_rows(clock)]
     return "\n".join(lines) + "\n"
 
 
@@ -123,7 +123,7 @@ def _clock(path: Path, where: str, table: Any) -> Clock:
         if key not in _CLOCK_KEYS:
             raise InputError(f"{path}: [{where}] unknown key '{key}'{nearest(key, _CLOCK_KEYS)}")
         number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not number or not math.isfinite(value):
+        if not number or not abs(value) <= sys.float_info.max:
             raise InputError(f"{path}: [{where}] {key} is {value!r}, expected a number")
         values[key] = float(value)
     if abs(values.get("drift_ppm", 0.0)) > MAX_DRIFT_PPM:
@@ -137,8 +137,3 @@ def _clock(path: Path, where: str, table: Any) -> Clock:
 def _rows(clock: Clock) -> list[str]:
     rows = [f"offset_s = {clock.offset_s + 0.0:.6f}", f"drift_ppm = {clock.drift_ppm + 0.0:.2f}"]
     return rows if clock.error_s is None else [*rows, f"error_s = {clock.error_s:.6f}"]
-
-
-def _text(value: str) -> str:
-    """A TOML string; JSON's escapes are TOML's."""
-    return json.dumps(value, ensure_ascii=False)

@@ -24,7 +24,9 @@ from fusecap.types import ImuReading
 EXACT_S = 1e-6
 """A frame this close to an instant is taken as it is."""
 MAX_GAP_S = 0.1
-"""IMU samples further apart are not interpolated between."""
+"""IMU samples further apart are not interpolated between; frames, where `MAX_GAP_PERIODS` of the
+camera's own are no longer."""
+MAX_GAP_PERIODS = 2.5
 GATE_HEIGHTS = 0.25
 """Two detections further apart than this share of a person's height are two people."""
 
@@ -34,9 +36,11 @@ def people_at(track: KeypointTrack, t_s: float) -> np.ndarray:
 
     A frame within 1 us is taken as it is. Between two frames keypoints that both have are
     interpolated; a keypoint or a person that only one of them has is missing. Where one of the
-    neighbours does not exist, the other holds for half a frame period.
+    neighbours does not exist, or the camera froze between them (more than 0.1 s and 2.5 of its
+    frame periods), the nearer holds for half a period.
     """
     period_s = 1.0 / track.rate_hz
+    max_gap_s = max(MAX_GAP_S, MAX_GAP_PERIODS * period_s)
     after = int(np.searchsorted(track.times_s, t_s - EXACT_S))
     nobody = np.empty((0, len(track.landmarks.landmark_names), 3))
     if after < len(track.frames) and abs(track.times_s[after] - t_s) <= EXACT_S:
@@ -44,8 +48,11 @@ def people_at(track: KeypointTrack, t_s: float) -> np.ndarray:
     before = after - 1
     neighbours = [i for i in (before, after) if 0 <= i < len(track.frames)]
     if len(neighbours) == 2 and track.frames[after] == track.frames[before] + 1:
-        share = (t_s - track.times_s[before]) / (track.times_s[after] - track.times_s[before])
-        return _between(track.people[before], track.people[after], float(share))
+        gap_s = float(track.times_s[after] - track.times_s[before])
+        if gap_s <= max_gap_s:
+            share = float(t_s - track.times_s[before]) / gap_s
+            return _between(track.people[before], track.people[after], share)
+    neighbours.sort(key=lambda i: abs(track.times_s[i] - t_s))
     near = [i for i in neighbours if abs(track.times_s[i] - t_s) <= period_s / 2]
     return track.people[near[0]] if near else nobody
 

@@ -24,6 +24,7 @@ from av.container import InputContainer
 from av.error import FFmpegError
 from av.stream import Disposition
 from av.video.frame import VideoFrame as DecodedFrame
+from av.video.reformatter import VideoReformatter
 from av.video.stream import VideoStream
 
 from fusecap.errors import InputError
@@ -79,6 +80,7 @@ class Video:
             claimed_s = None if container.duration is None else container.duration / 1e6
         if len(self._pts) == 0:
             raise InputError(f"{self.path}: a video without frames; record or copy it again")
+        self._reformatter = VideoReformatter()
         first = self._first_frame()
         ns = (self._pts - self._pts[0]) * (tick * 1_000_000_000).numerator
         self.times_ns: np.ndarray = ns // (tick * 1_000_000_000).denominator
@@ -163,7 +165,7 @@ class Video:
         )
 
     def _image(self, frame: DecodedFrame) -> np.ndarray:
-        image = frame.to_ndarray(format="bgr24")
+        image = self._reformatter.reformat(frame, format="bgr24", threads=1).to_ndarray()
         if self._rotation_deg:
             image = np.rot90(image, self._rotation_deg // 90)
         width, height = self.info.size_px

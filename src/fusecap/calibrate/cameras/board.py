@@ -89,7 +89,8 @@ class Board:
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
             raise CalibrationError(f"kind is '{self.kind}'{nearest(self.kind, KINDS)}")
-        for key, least in (("columns", 3), ("rows", 3)):
+        least = 4 if self.kind == CHECKERBOARD else 3
+        for key in ("columns", "rows"):
             if not least <= getattr(self, key) <= 100:
                 raise CalibrationError(
                     f"{key} = {getattr(self, key)}, expected the number of squares, {least} to 100"

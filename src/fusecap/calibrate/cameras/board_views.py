@@ -117,14 +117,12 @@ def read_shots(
             )
         )
     if not shots:
-        inspected = sum(1 for _ in without)
         clue = why_not_found(board, without) or (
             f"the board file says {board.words}; check it, and that the entire board is lit, "
             "sharp and large enough (a marker's edge needs some 20 px)"
         )
         raise CalibrationError(
-            f"camera '{name}' ({source}): the board is in none of {max(total, inspected)} images; "
-            f"{clue}"
+            f"camera '{name}' ({source}): the board is in none of {total} images; {clue}"
         )
     steepness = np.array([shot.sharpness for shot in shots])
     sharp = steepness > BLURRED * np.median(steepness)
@@ -208,8 +206,7 @@ def _look(view: BoardView, size_px: tuple[int, int]) -> np.ndarray:
     """Place, extent and shape in the image: what the mean and covariance of its corners show."""
     scaled = view.pixels / max(size_px)
     centred = scaled - scaled.mean(axis=0)
-    u, s, vt = np.linalg.svd(centred / np.sqrt(len(view)), full_matrices=False)
-    del u
+    _, s, vt = np.linalg.svd(centred / np.sqrt(len(view)), full_matrices=False)
     root = vt.T @ np.diag(s) @ vt
     return np.concatenate([scaled.mean(axis=0), 3 * root[np.triu_indices(2)]])
 

@@ -137,7 +137,7 @@ def adjust(
         boards=boards,
         covariance=np.linalg.pinv(_reduced(current, 0.0)[0], hermitian=True),
         steps=steps,
-        converged=converged,
+        converged=converged and bool(np.isfinite(current.cost)),
     )
 
 

@@ -25,7 +25,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
@@ -37,10 +36,12 @@ from fusecap.calibrate.cameras.bundle_adjustment import (
     residuals_px,
     stack_views,
 )
+from fusecap.calibrate.cameras.planar_pose import planar_poses
 from fusecap.calibrate.cameras.robust import outlying, robust_scale_px, view_rms_px
 from fusecap.errors import CalibrationError
 from fusecap.geometry.camera import Camera, Rig
 from fusecap.geometry.projection_derivatives import PARAMETERS, POSE
+from fusecap.geometry.similarity import fitted_similarity
 from fusecap.geometry.triangulation import triangulate
 
 MIN_SHARED = 3
@@ -235,17 +236,17 @@ def repeatability(
             }
         try:
             check_connected([camera.name for camera in solution.cameras], resampled)
+            other = _adjusted(
+                solution.cameras, resampled, boards, board, refine_intrinsics=refine_intrinsics
+            )
         except CalibrationError:
             continue
-        other = _adjusted(
-            solution.cameras, resampled, boards, board, refine_intrinsics=refine_intrinsics
-        )
-        turn, shift = _rigid(
+        onto = fitted_similarity(
             np.concatenate([_board_points(other.boards[k], board) for k in other.boards]),
             np.concatenate([_board_points(boards[k], board) for k in other.boards]),
         )
-        centres.append([turn @ c.position_in_world + shift for c in other.cameras])
-        turns.append([c.rotation @ turn.T for c in other.cameras])
+        centres.append([onto.points(c.position_in_world) for c in other.cameras])
+        turns.append([c.rotation @ onto.rotation.T for c in other.cameras])
     progress("resampled calibrations", resamples, resamples)
     if len(centres) < 2:
         return Repeatability(
@@ -314,25 +315,15 @@ def _proposals(cameras: Sequence[Camera], views: Views, board: Board) -> Proposa
 def _poses(camera: Camera, view: BoardView, board: Board) -> list[np.ndarray]:
     """cam_from_board, one or two; the second only where it explains the view nearly as well."""
     points = board.corners_in_board_m[view.corner_ids]
-    with np.errstate(over="ignore", invalid="ignore"):
-        xy = camera.undistort(view.pixels)
-    if not np.isfinite(xy).all():
-        return []
-    # IPPE wants the plane's points about its origin; the shift is undone below.
-    middle = points.mean(axis=0)
-    count, turns, shifts, errors = cv2.solvePnPGeneric(
-        points - middle, xy[:, None], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
-    )[:4]
-    poses = []
-    for index in range(count):
-        pose = np.eye(4)
-        pose[:3, :3] = Rotation.from_rotvec(np.asarray(turns[index]).ravel()).as_matrix()
-        pose[:3, 3] = np.asarray(shifts[index]).ravel() - pose[:3, :3] @ middle
-        near = np.asarray(errors).ravel()
-        sane = np.isfinite(pose).all() and (points @ pose[2, :3] + pose[2, 3] > 0).all()
-        if sane and (index == 0 or near[index] < 3 * near[0] + 1.0 / camera.matrix[0, 0]):
-            poses.append(pose)
-    return poses
+    found = planar_poses(camera, points, view.pixels)
+    near = [error < 3 * found[0][1] + 1.0 / camera.matrix[0, 0] for _, error in found]
+    return [
+        pose
+        for index, (pose, _) in enumerate(found)
+        if np.isfinite(pose).all()
+        and (points @ pose[2, :3] + pose[2, 3] > 0).all()
+        and (index == 0 or near[index])
+    ]
 
 
 def _placed(
@@ -514,14 +505,6 @@ def _reachable(linked: np.ndarray) -> set[int]:
                 reached.add(other)
                 front.append(other)
     return reached
-
-
-def _rigid(points: np.ndarray, onto: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation and shift of least squares [Kabsch]."""
-    a, b = points.mean(axis=0), onto.mean(axis=0)
-    u, _, vt = np.linalg.svd((onto - b).T @ (points - a))
-    turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    return turn, b - turn @ a
 
 
 def _board_points(pose: np.ndarray, board: Board) -> np.ndarray:

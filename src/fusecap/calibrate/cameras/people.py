@@ -32,7 +32,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.body.pose import forward_kinematics, landmarks_in_world
@@ -47,10 +47,10 @@ from fusecap.calibrate.cameras.people_adjust import (
 )
 from fusecap.calibrate.cameras.people_gauge import align, gauge_free, motions
 from fusecap.calibrate.cameras.people_sightings import Sightings, roughness, sight, stride_of
-from fusecap.calibrate.cameras.world_frame import Similarity
 from fusecap.calibrate.offsets import reprojection_error_px
 from fusecap.errors import InputError
 from fusecap.geometry.camera import Rig
+from fusecap.geometry.similarity import Similarity
 from fusecap.geometry.triangulation import ROBUST_SCALE_PX, triangulate
 from fusecap.offline.solve import Progress, solve_instants
 from fusecap.scene import scene_of
@@ -368,7 +368,7 @@ class _Session:
                 for c, name in enumerate(rig.names)
             },
         )
-        return replace(result, notes=_notes(result, found, rough))
+        return replace(result, notes=_notes(result, rough, found.rows.views))
 
     @property
     def _landmarks(self) -> LandmarkSet:
@@ -660,7 +660,10 @@ def _feet_m(points: Float[np.ndarray, "n k 3"], landmarks: LandmarkSet) -> float
     return float(np.percentile(height, 10)) if len(height) else float("nan")
 
 
-def _notes(result: PeopleCalibration, found: _Found, rough: Rig) -> tuple[str, ...]:
+def _notes(
+    result: PeopleCalibration, rough: Rig, views: Bool[np.ndarray, "n c"]
+) -> tuple[str, ...]:
+    """What could not be measured counts as poor; `views` are the adjustment's."""
     notes = []
     if not result.improved:
         notes.append(
@@ -672,7 +675,6 @@ def _notes(result: PeopleCalibration, found: _Found, rough: Rig) -> tuple[str, .
             f"people stay within {result.walked_m[0]:.1f} x {result.walked_m[1]:.1f} m: record "
             "someone who walks through the whole volume"
         )
-    views = found.rows.views
     cameras = list(zip(result.cameras, rough.cameras, views.T, strict=True))
 
     def note(which: Sequence[str], remedy: str) -> None:
@@ -692,7 +694,7 @@ def _notes(result: PeopleCalibration, found: _Found, rough: Rig) -> tuple[str, .
         [
             f"'{c.name}' ({c.repeat_mm:.0f} mm, {c.repeat_deg:.2f} deg)"
             for c, _, _ in cameras
-            if c.repeat_mm > 1e3 * UNSURE_M or c.repeat_deg > np.degrees(UNSURE_RAD)
+            if not (c.repeat_mm <= 1e3 * UNSURE_M and c.repeat_deg <= np.degrees(UNSURE_RAD))
         ],
         "not known better than that: record longer, with more people and poses",
     )
@@ -703,6 +705,18 @@ def _notes(result: PeopleCalibration, found: _Found, rough: Rig) -> tuple[str, .
             if seen.sum() < SHARED_SHARE * len(seen)
         ],
         "little is shared with other cameras: let people walk where views meet",
+    )
+    note(
+        [f"'{c.name}'" for c in result.cameras if not c.after.keypoints],
+        "no held-out keypoint checks it: record longer, with people where views meet",
+    )
+    note(
+        [
+            f"'{c.name}' ({c.before.median_px:.1f} -> {c.after.median_px:.1f} px)"
+            for c in result.cameras
+            if result.improved and _better(c.before, c.after)
+        ],
+        "fits worse than before although all together fit better: check its lens and its clock",
     )
     note(
         [

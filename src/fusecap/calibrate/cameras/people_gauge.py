@@ -20,8 +20,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from fusecap.calibrate.cameras.world_frame import Similarity
 from fusecap.geometry.camera import Rig
+from fusecap.geometry.similarity import Similarity
 
 _ROUNDS = 30
 _MIN_SHIFT_M, _MIN_ANGLE_RAD = 0.002, np.radians(0.05)

@@ -30,6 +30,12 @@ GOOD_CENTRE, POOR_CENTRE = 0.003, 0.015
 GOOD_COVERAGE = 0.3
 """Of the cells of each image."""
 ENOUGH_INSTANTS, FEW_INSTANTS = 15, 5
+WORST_CAMERA = 2.0
+"""One camera may miss by so many times what all together may."""
+GOOD_LEFT_OUT, POOR_LEFT_OUT = 0.1, 0.3
+"""Share of the views that contradict the rest: beyond a third, which are the right ones is open."""
+GOOD_RESAMPLES, POOR_RESAMPLES = 8, 5
+"""Of `RESAMPLES`, those in which all cameras stay connected."""
 
 Progress = Callable[[str, int, int], None]
 
@@ -50,6 +56,8 @@ class CameraReport:
     """Share of the image's cells that hold a corner."""
     centre_spread_mm: float
     rotation_spread_deg: float
+    pixel_scale: float
+    """A pixel of this camera in pixels of a 1920-pixel-wide image."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,8 +118,8 @@ def calibrate_rig(
     if board.ambiguous:
         raise CalibrationError(
             f"a {board.words} looks the same after half a turn, so cameras that see it from "
-            "different sides disagree on its first corner; use a charuco board, or a checkerboard "
-            "with an even and an odd number of squares"
+            "different sides disagree on its first corner; print a charuco board (fusecap "
+            f"calibrate board), or a checkerboard of {board.columns} x {board.rows + 1} squares"
         )
     for camera, shots in zip(cameras, found, strict=True):
         if camera.size_px != shots.size_px:
@@ -167,6 +175,7 @@ def _report(
                 coverage=float((cells > 0).mean()),
                 centre_spread_mm=repeated.centre_mm[index],
                 rotation_spread_deg=repeated.rotation_deg[index],
+                pixel_scale=camera.pixel_scale,
             )
         )
         for shot in used:
@@ -188,8 +197,14 @@ def _report(
         for b in found[i + 1 :]
     }
     scaled = [view.fitted_px * solution.cameras[view.camera].pixel_scale for view in held_out]
-    verdict, advice = _verdict(
-        error_px=_median(scaled), scale=scale, cameras=cameras, size_m=size, instants=len(instants)
+    verdict, advice = verdict_of(
+        error_px=_median(scaled),
+        scale=scale,
+        cameras=cameras,
+        size_m=size,
+        instants=len(instants),
+        left_out=len(left_out) / max(len(views), 1),
+        resamples=repeated.resamples,
     )
     return RigReport(
         cameras=tuple(cameras),
@@ -207,15 +222,21 @@ def _report(
     )
 
 
-def _verdict(
+def verdict_of(
     *,
     error_px: float,
     scale: ScaleCheck,
     cameras: Sequence[CameraReport],
     size_m: float,
     instants: int,
+    left_out: float,
+    resamples: int,
 ) -> tuple[str, tuple[str, ...]]:
-    """The worst of all marks; what could not be measured counts as poor."""
+    """The worst of all marks, and what to do; what could not be measured counts as poor.
+
+    `error_px` is the median of all held-out corners in pixels of a 1920-pixel-wide image,
+    `left_out` the share of views that contradict the rest.
+    """
     marks, advice = [0], []
 
     def mark(value: float | int, good: float | int, poor: float | int, remedy: str) -> None:
@@ -231,14 +252,21 @@ def _verdict(
         f"{instants} instants with the board in two cameras are few: record {ENOUGH_INSTANTS} or "
         "more, all over the volume",
     )
-    worst = max(cameras, key=lambda c: np.nan_to_num(c.held_out_median_px, nan=np.inf))
+    worst = max(cameras, key=lambda c: np.nan_to_num(_scaled_px(c), nan=np.inf))
     mark(
-        error_px,
+        left_out,
+        GOOD_LEFT_OUT,
+        POOR_LEFT_OUT,
+        f"{100 * left_out:.0f} % of the views contradict the rest and were left out: check that "
+        "cameras are in step and that the board does not bend",
+    )
+    mark(
+        float(np.maximum(error_px, _scaled_px(worst) / WORST_CAMERA)),
         GOOD_PX,
         POOR_PX,
         f"held-out corners miss by {error_px:.1f} px of a {REFERENCE_WIDTH_PX:.0f}-px-wide image "
-        f"in the median, most in '{worst.name}': move the board slowly or hold it still, check "
-        "that cameras are in step and that intrinsics belong to them",
+        f"in the median, most in '{worst.name}' ({_scaled_px(worst):.1f} px): move the board "
+        "slowly or hold it still, check that cameras are in step and intrinsics theirs",
     )
     least = min(cameras, key=lambda c: c.coverage)
     mark(
@@ -264,7 +292,19 @@ def _verdict(
         f"'{spread.name}' moves by {spread.centre_spread_mm:.0f} mm with the choice of instants: "
         "record more boards that it shares with the others, closer to the cameras and tilted",
     )
+    mark(
+        -resamples,
+        -GOOD_RESAMPLES,
+        -POOR_RESAMPLES,
+        f"only {resamples} of {extrinsics.RESAMPLES} resampled calibrations connect all cameras: "
+        "record more boards that cameras see together",
+    )
     return ("good", "usable", "poor")[max(marks)], tuple(advice)
+
+
+def _scaled_px(camera: CameraReport) -> float:
+    """Median held-out error, in pixels of a 1920-pixel-wide image."""
+    return camera.held_out_median_px * camera.pixel_scale
 
 
 def plot_rig(calibration: RigCalibration, found: Sequence[CameraShots], path: Path) -> None:

@@ -19,21 +19,18 @@ degrees of tilt in two views and 0.11 in four: 10 and 8 mm of height at 4 m.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import OptimizeResult, least_squares
 from scipy.spatial.transform import Rotation
 
 from fusecap.calibrate.cameras.board import Board, BoardView
+from fusecap.calibrate.cameras.floor_board import fit_board
 from fusecap.errors import CalibrationError, InputError, nearest
-from fusecap.geometry.camera import REFERENCE_WIDTH_PX, Y_UP_FROM_Z_UP, Camera, Rig
-from fusecap.geometry.projection_derivatives import projection_derivatives
+from fusecap.geometry.camera import Rig
+from fusecap.geometry.similarity import Similarity, fitted_similarity, least_turn
 from fusecap.geometry.triangulation import triangulate
-from fusecap.sources.imu_files.track import GRAVITY_M_S2, ImuTrack
 from fusecap.sources.marked_points import MarkedPoints
 
 FLAT = 0.05
@@ -44,9 +41,6 @@ OUTLIER_M = 0.02
 """And at least this far."""
 CLICK_ROBUST_PX = 25.0
 """Marks are made by hand; one that is farther off than three times this is a mistake."""
-AT_REST_M_S2 = 0.15
-"""Standard deviation per axis of an accelerometer that lies still."""
-GRAVITY_WITHIN_M_S2 = 0.5
 POOR_PX = 2.0
 """Of a 1920-pixel-wide image: reprojection above which a board does not lie as it is seen."""
 POOR_MM = 20.0
@@ -55,55 +49,6 @@ POOR_SCALE = 0.01
 
 REFERENCES = {"nwu": 0.0, "enu": 90.0}
 """Reference worlds of IMUs: the compass bearing of their x axis [degrees]."""
-AXES = {
-    "right": (1.0, 0.0, 0.0),
-    "left": (-1.0, 0.0, 0.0),
-    "down": (0.0, 1.0, 0.0),
-    "up": (0.0, -1.0, 0.0),
-    "forward": (0.0, 0.0, 1.0),
-    "back": (0.0, 0.0, -1.0),
-}
-"""Directions of a camera as seen in its image, and of a board as seen by who looks at it."""
-_STARTS = 2
-"""Poses from single views, the best first, from which all views are fitted."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Similarity:
-    """new = scale * rotation @ old + translation."""
-
-    rotation: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
-    translation_m: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
-    scale: float = 1.0
-
-    def points(self, points_in_old: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-        """The points in the new world."""
-        return self.scale * points_in_old @ self.rotation.T + self.translation_m
-
-    def rig(self, rig: Rig) -> Rig:
-        """The cameras in the new world; they see what they saw."""
-        return Rig(cameras=tuple(self._camera(camera) for camera in rig.cameras))
-
-    def after(self, first: Similarity) -> Similarity:
-        """Both as one: `first`, then this."""
-        return Similarity(
-            rotation=self.rotation @ first.rotation,
-            translation_m=self.points(first.translation_m),
-            scale=self.scale * first.scale,
-        )
-
-    @property
-    def angle_deg(self) -> float:
-        """How far the axes turn."""
-        return float(np.degrees(np.linalg.norm(Rotation.from_matrix(self.rotation).as_rotvec())))
-
-    def _camera(self, camera: Camera) -> Camera:
-        rotation = camera.rotation @ self.rotation.T
-        return replace(
-            camera,
-            rotation=rotation,
-            translation=self.scale * camera.translation - rotation @ self.translation_m,
-        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,13 +105,13 @@ def from_board(
         raise CalibrationError(
             "one view cannot tell the calibration's scale from a board; give two or more"
         )
-    fit = _fit_board(rig, board, views, scale=False)
-    with_scale = _fit_board(rig, board, views, scale=True) if len(views) > 1 else None
+    fit = fit_board(rig, board, views, scale=False)
+    with_scale = fit_board(rig, board, views, scale=True) if len(views) > 1 else None
     chosen = with_scale if scale and with_scale is not None else fit
     found_scale = None if with_scale is None else 1.0 / with_scale.size
     world_from_board = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     if up_in_board is not None:
-        level = _least_turn(world_from_board @ up_in_board, np.array([0.0, 1.0, 0.0]))
+        level = least_turn(world_from_board @ up_in_board, np.array([0.0, 1.0, 0.0]))
         world_from_board = level @ world_from_board
     rotation = world_from_board @ chosen.rotation.T
     grow = 1.0 / chosen.size
@@ -220,14 +165,15 @@ def from_points(rig: Rig, points: MarkedPoints, *, scale: bool = False) -> Place
     _check_spread(old, "the marked points, as the cameras see them,")
 
     def distance(kept: np.ndarray) -> np.ndarray:
-        fitted = _umeyama(old[kept], new[kept], scale)
-        return np.linalg.norm(fitted.points(old) - new, axis=1)
+        return np.linalg.norm(
+            fitted_similarity(old[kept], new[kept], scale=scale).points(old) - new, axis=1
+        )
 
     used = _without_outlier(new, distance, least=3)
-    change = _umeyama(old[used], new[used], scale)
+    change = fitted_similarity(old[used], new[used], scale=scale)
     away_m = np.linalg.norm(change.points(old) - new, axis=1)
     rms_mm = 1e3 * float(np.sqrt(np.mean(away_m[used] ** 2)))
-    similar = _umeyama(old[used], new[used], True)
+    similar = fitted_similarity(old[used], new[used], scale=True)
     problems = _outlier_words(names, away_m, used)
     if rms_mm > POOR_MM:
         problems.append(
@@ -275,7 +221,7 @@ def from_floor_points(
             off = (old[used] - old[used].mean(axis=0)) @ up
             noise = np.sqrt(np.sum(off**2) / (used.sum() - 3))
             tilt_deg = float(np.degrees(noise / (spread_m * np.sqrt(used.sum()))))
-    rotation = _least_turn(up, np.array([0.0, 1.0, 0.0]))
+    rotation = least_turn(up, np.array([0.0, 1.0, 0.0]))
     height = old @ rotation.T[:, 1]
     floor = height[used].mean()
     away_m = np.abs(height - floor)
@@ -302,64 +248,12 @@ def from_floor_points(
 def from_gravity(up_in_old: Float[np.ndarray, "3"]) -> Placement:
     """The world turned until `up_in_old` is y; its origin stays, so the floor is still unknown."""
     return Placement(
-        change=Similarity(rotation=_least_turn(up_in_old, np.array([0.0, 1.0, 0.0]))),
+        change=Similarity(rotation=least_turn(up_in_old, np.array([0.0, 1.0, 0.0]))),
         how="gravity",
         problems=(
             "gravity says what is up, not where the floor is; add --floor-points with one point "
             "or more, or --board, or set floor = false in the session",
         ),
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class RestingImu:
-    """What an IMU that lies still says about the thing it is fixed to."""
-
-    up_in_body: Float[np.ndarray, "3"]
-    """Unit, in the frame of the camera (OpenCV's axes) or of the board."""
-    reference_from_body: Float[np.ndarray, "3 3"]
-    """From its orientation, into its reference world turned to y up."""
-    spread_m_s2: float
-    contradiction_deg: float
-    """Between up by its accelerometer and up by its orientation."""
-
-
-def resting_imu(track: ImuTrack, *, axes: str, imu_up: str = "z") -> RestingImu:
-    """The mean of a recording at rest.
-
-    `axes` says where the sensor's x and y axes point, such as "right,up": words of `AXES`. `imu_up`
-    is the up axis of its reference world. Raises `InputError` for a sensor that moves or does not
-    measure gravity.
-    """
-    body_from_imu = _axes(axes)
-    accel = track.accel_m_s2[np.isfinite(track.accel_m_s2[:, 0])]
-    if len(accel) < 10:
-        raise InputError(
-            f"{len(accel)} samples have an acceleration, expected a second of them or more; export "
-            "the recording with its calibrated acceleration"
-        )
-    mean = accel.mean(axis=0)
-    spread = float(accel.std(axis=0).max())
-    if spread > AT_REST_M_S2:
-        raise InputError(
-            f"the sensor moved: its acceleration varies by {spread:.2f} m/s2, expected less than "
-            f"{AT_REST_M_S2} m/s2; leave it alone for some seconds, and cut the file to these"
-        )
-    size = float(np.linalg.norm(mean))
-    if abs(size - GRAVITY_M_S2) > GRAVITY_WITHIN_M_S2:
-        raise InputError(
-            f"the sensor's mean acceleration is {size:.2f} m/s2, expected {GRAVITY_M_S2:.2f}: "
-            "gravity must not be removed, and the unit be m/s2"
-        )
-    imu = Rotation.from_quat(track.orientation_wxyz[:, [1, 2, 3, 0]]).mean()
-    y_up = Y_UP_FROM_Z_UP if imu_up == "z" else np.eye(3)
-    reference_from_imu = y_up @ imu.as_matrix()
-    told = reference_from_imu @ (mean / size)
-    return RestingImu(
-        up_in_body=body_from_imu @ (mean / size),
-        reference_from_body=reference_from_imu @ body_from_imu.T,
-        spread_m_s2=spread,
-        contradiction_deg=float(np.degrees(np.arccos(np.clip(told[1], -1.0, 1.0)))),
     )
 
 
@@ -405,165 +299,6 @@ def known_length(
     return Similarity(scale=length_m / distance)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _BoardFit:
-    rotation: np.ndarray
-    """old world from board"""
-    translation_m: np.ndarray
-    size: float
-    """Of the board in the calibration's metres, over its true size."""
-    rms_px: float
-    tilt_deg: float
-    camera_px: dict[str, float]
-
-
-def _fit_board(rig: Rig, board: Board, views: Mapping[str, BoardView], *, scale: bool) -> _BoardFit:
-    """The pose of least squared reprojection, over all views together."""
-    cameras = [rig[name] for name in views]
-    starts = []
-    for camera, view in zip(cameras, views.values(), strict=True):
-        for rotation, translation in _poses_in_world(camera, board, view):
-            seen = _ordered(cameras, board, list(views.values()), rotation, translation)
-            fit = _BoardDescent(cameras, board, seen, rotation, translation, scale)
-            starts.append((float(np.sum(fit.residuals(fit.start) ** 2)), len(starts), fit))
-    if not starts:
-        raise CalibrationError(
-            "the board's corners give no pose; check board.toml and the images' resolution"
-        )
-    ends = [fit.descend() for _, _, fit in sorted(starts)[:_STARTS]]
-    best = min(ends, key=lambda end: end[-1].cost)
-    rotation, translation, size, result = best
-    squared = result.fun.reshape(-1, 2)
-    counts = [len(view) for view in views.values()]
-    parts = np.split(squared, np.cumsum(counts)[:-1])
-    freedom = max(result.fun.size - result.x.size, 1)
-    covariance = np.linalg.pinv(result.jac.T @ result.jac) * (2 * result.cost / freedom)
-    return _BoardFit(
-        rotation=rotation,
-        translation_m=translation,
-        size=size,
-        rms_px=float(np.sqrt(np.mean(np.sum(squared**2, axis=1)))),
-        tilt_deg=float(np.degrees(np.sqrt(max(covariance[0, 0], covariance[1, 1])))),
-        camera_px={
-            camera.name: float(np.sqrt(np.mean(np.sum(part**2, axis=1)))) / camera.pixel_scale
-            for camera, part in zip(cameras, parts, strict=True)
-        },
-    )
-
-
-def _poses_in_world(
-    camera: Camera, board: Board, view: BoardView
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Both poses that a plane in one view may have (Collins and Bartoli 2014)."""
-    corners = board.corners_in_board_m[view.corner_ids]
-    middle = corners.mean(axis=0)
-    rays = camera.undistort(view.pixels)
-    _, turns, shifts, _ = cv2.solvePnPGeneric(
-        corners - middle, rays, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
-    )
-    poses = []
-    for turn, shift in zip(turns, shifts, strict=True):
-        in_cam = Rotation.from_rotvec(turn.ravel()).as_matrix()
-        place = shift.ravel() - in_cam @ middle
-        if np.isfinite(in_cam).all() and np.isfinite(place).all():
-            rotation = camera.rotation.T @ in_cam
-            poses.append((rotation, camera.rotation.T @ (place - camera.translation)))
-    return poses
-
-
-def _ordered(
-    cameras: Sequence[Camera],
-    board: Board,
-    views: Sequence[BoardView],
-    rotation: np.ndarray,
-    translation: np.ndarray,
-) -> list[BoardView]:
-    """The views with their corners named from the end that this pose suggests."""
-    if not board.ambiguous:
-        return list(views)
-    last = len(board.corners_in_board_m) - 1
-    result = []
-    for camera, view in zip(cameras, views, strict=True):
-        turned = replace(view, corner_ids=(last - view.corner_ids)[::-1], pixels=view.pixels[::-1])
-        away = [
-            np.nanmean(
-                np.abs(
-                    camera.project(
-                        board.corners_in_board_m[each.corner_ids] @ rotation.T + translation
-                    )
-                    - each.pixels
-                )
-            )
-            for each in (view, turned)
-        ]
-        result.append(view if not away[1] < away[0] else turned)
-    return result
-
-
-class _BoardDescent:
-    """Least squares about a pose.
-
-    Its numbers are turns about the board's own axes, so that the first two are tilts, a shift in
-    the world and, with `scale`, the logarithm of the board's size.
-    """
-
-    def __init__(
-        self,
-        cameras: Sequence[Camera],
-        board: Board,
-        views: Sequence[BoardView],
-        rotation: np.ndarray,
-        translation: np.ndarray,
-        scale: bool,
-    ) -> None:
-        self._cameras = cameras
-        self._views = views
-        self._corners = board.corners_in_board_m
-        self._rotation, self._translation = rotation, translation
-        self.start = np.zeros(7 if scale else 6)
-
-    def descend(self) -> tuple[np.ndarray, np.ndarray, float, OptimizeResult]:
-        """Rotation, translation and size; the Jacobian of the result is about its own pose."""
-        near = self._least_squares(self.start)
-        self._rotation, self._translation, _ = self._pose(near.x)
-        again = np.concatenate([np.zeros(6), near.x[6:]])
-        result = self._least_squares(again)
-        return *self._pose(result.x), result
-
-    def _least_squares(self, x: np.ndarray) -> OptimizeResult:
-        jacobian: Any = self._jacobian
-        return least_squares(self.residuals, x, jacobian, x_scale="jac", xtol=1e-12)
-
-    def _pose(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        turned = self._rotation @ Rotation.from_rotvec(x[:3]).as_matrix()
-        return turned, self._translation + x[3:6], float(np.exp(x[6])) if len(x) > 6 else 1.0
-
-    def residuals(self, x: np.ndarray) -> np.ndarray:
-        """Pixels of a 1920-pixel-wide image."""
-        turned, place, size = self._pose(x)
-        parts = []
-        for camera, view in zip(self._cameras, self._views, strict=True):
-            corners = size * self._corners[view.corner_ids] @ turned.T + place
-            away = (camera.project(corners) - view.pixels) * camera.pixel_scale
-            parts.append(np.nan_to_num(away, nan=REFERENCE_WIDTH_PX))
-        return np.concatenate(parts).ravel()
-
-    def _jacobian(self, x: np.ndarray) -> np.ndarray:
-        turned, place, size = self._pose(x)
-        parts = []
-        for camera, view in zip(self._cameras, self._views, strict=True):
-            corners = size * self._corners[view.corner_ids]
-            _, _, by_point = projection_derivatives(camera, corners @ turned.T + place)
-            by_turn = np.empty_like(by_point)
-            for axis in range(3):
-                moved = np.cross(np.eye(3)[axis], corners) @ turned.T
-                by_turn[:, :, axis] = np.einsum("nij,nj->ni", by_point, moved)
-            by_size = np.einsum("nij,nj->ni", by_point, corners @ turned.T)[:, :, None]
-            both = np.concatenate([by_turn, by_point, by_size], axis=2)[:, :, : len(x)]
-            parts.append(both.reshape(-1, len(x)) * camera.pixel_scale)
-        return np.concatenate(parts)
-
-
 def _triangulated(
     rig: Rig, points: MarkedPoints, least: int = 3
 ) -> tuple[np.ndarray, list[int], tuple[str, ...]]:
@@ -584,21 +319,6 @@ def _check_spread(points: np.ndarray, what: str) -> None:
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     if len(points) < 3 or spread[1] < FLAT * max(spread[0], 1e-9):
         raise InputError(f"{what} lie on a line; mark another one aside")
-
-
-def _umeyama(old: np.ndarray, new: np.ndarray, scale: bool) -> Similarity:
-    """Least squares of new - (s R old + t); Umeyama, IEEE PAMI 13 (1991)."""
-    old_middle, new_middle = old.mean(axis=0), new.mean(axis=0)
-    a, b = old - old_middle, new - new_middle
-    u, singular, vt = np.linalg.svd(b.T @ a)
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    rotation = (u * sign) @ vt
-    size = float(singular @ sign / np.sum(a * a)) if scale else 1.0
-    return Similarity(
-        rotation=rotation,
-        translation_m=new_middle - size * rotation @ old_middle,
-        scale=size,
-    )
 
 
 def _without_outlier(points: np.ndarray, distance, *, least: int) -> np.ndarray:
@@ -654,32 +374,6 @@ def _point_residuals(
         for name, away, kept in zip(names, away_m, used, strict=True)
     ]
     return (*seen, *(Residual(name=name, used=False) for name in unseen))
-
-
-def _axes(words: str) -> np.ndarray:
-    """body_from_imu, from where the sensor's x and y point."""
-    names = [word.strip() for word in words.split(",")]
-    for name in names:
-        if name not in AXES:
-            raise InputError(f"sensor axes '{words}': no direction '{name}'{nearest(name, AXES)}")
-    directions = np.array([AXES[name] for name in names])
-    if len(names) != 2 or abs(directions[0] @ directions[1]) > 0.5:
-        raise InputError(
-            f"sensor axes '{words}', expected where its x and its y point, such as right,up"
-        )
-    return np.column_stack([*directions, np.cross(*directions)])
-
-
-def _least_turn(direction: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """The rotation of least angle that brings one direction to another."""
-    direction = direction / np.linalg.norm(direction)
-    cosine = float(direction @ target)
-    if cosine < -1 + 1e-9:
-        aside = np.cross(direction, np.eye(3)[int(np.argmin(np.abs(direction)))])
-        return Rotation.from_rotvec(np.pi * aside / np.linalg.norm(aside)).as_matrix()
-    x, y, z = np.cross(direction, target)
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + cross + cross @ cross / (1 + cosine)
 
 
 def _turn_about_up(angle_rad: float) -> Similarity:

@@ -295,6 +295,13 @@ def inverse_right_jacobian(vector: Float[np.ndarray, "n 3"]) -> Float[np.ndarray
     return np.eye(3) + cross / 2 + factor[:, None, None] * (cross @ cross)
 
 
+def linearised(
+    pairs: Pairs, mounting: Float[np.ndarray, "3 3"], heading_rad: Float[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 4"]]:
+    """The error e and its derivatives by (turn of the mounting, heading)."""
+    return _linearised(pairs, mounting, heading_rad, np.zeros(len(pairs)), 4)
+
+
 def _covariance(
     pairs: Pairs,
     error: Float[np.ndarray, "n 3"],

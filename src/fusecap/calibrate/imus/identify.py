@@ -61,9 +61,10 @@ def identify(
 ) -> tuple[Identity, ...]:
     """The best assignment of sensors (orientations at the reference's instants) to bones.
 
-    Candidates are the stated bones and those of `among`.
+    Candidates are the stated bones, each for as many sensors as are stated on it, and those of
+    `among`.
     """
-    bones = list(dict.fromkeys([*stated, *among]))
+    bones = [*stated, *(bone for bone in among if bone not in stated)]
     step = max(1, len(reference.times_s) // MAX_INSTANTS)
     times_s = reference.times_s[::step]
     score = np.full((len(stated), len(bones)), -np.inf)
@@ -90,7 +91,7 @@ def identify(
                 for other in range(len(bones))
             ]
         )
-        loss[column] = np.inf
+        loss[[bone == bones[column] for bone in bones]] = np.inf
         other = int(np.argmin(loss))
         index = reference.skeleton.bone(bones[column])
         speeds = [

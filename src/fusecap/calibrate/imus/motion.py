@@ -5,14 +5,17 @@
 3. Sensors that were reset together share their world: the headings' common value and spread,
    measured on the sensors that observe theirs, are a prior for all in a second fit. A trunk that
    stays upright cannot tell its sensor's heading from its mounting; the arms and legs can.
-4. Each stretch of time is left out once (`FOLDS` interleaved parts), and the residual taken there.
-5. Sensors on other bones than stated, and sensors that slipped, are named.
+4. Sensors on other bones than stated, and sensors that slipped, are named.
+5. Where landmarks are known, the others are fitted together
+   (`fusecap.calibrate.imus.joint_centres`).
+6. Each stretch of time is left out once (`FOLDS` interleaved parts), and the residual taken there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float
@@ -30,6 +33,7 @@ from fusecap.calibrate.imus.fit import (
     with_known_pose,
 )
 from fusecap.calibrate.imus.identify import Identity, identify
+from fusecap.calibrate.imus.joint_centres import SeenLandmarks, fit_together, held_back
 from fusecap.calibrate.imus.reference import ReferenceMotion
 from fusecap.calibrate.imus.speeds import lag_s
 from fusecap.calibrate.imus.tpose import TPOSE_SIGMA_RAD, TPose
@@ -54,6 +58,10 @@ POOR_DEG = 15.0
 """A held-out residual above this is not a calibration."""
 LOOSE_DEG, UNOBSERVED_DEG = 8.0, 14.0
 """Uncertainty about an axis beyond which it is called so."""
+
+
+Mask = Callable[[np.ndarray], np.ndarray]
+"""From stretches of time to which of them count."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,8 +148,16 @@ def sensor_rotations(
     return np.swapaxes(resample_imus(mounted, times_s)[0], 0, 1)
 
 
-def calibrate_subject(reference: ReferenceMotion, worn: Sequence[Worn]) -> SubjectCalibration:
-    """All steps; raises `InputError` where nothing was seen of the subject or clocks disagree."""
+def calibrate_subject(
+    reference: ReferenceMotion,
+    worn: Sequence[Worn],
+    seen: SeenLandmarks | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> SubjectCalibration:
+    """All steps; raises `InputError` where nothing was seen of the subject or clocks disagree.
+
+    `progress` is told how many of how many steps are done.
+    """
     _check_reference(reference)
     rotations = sensor_rotations(worn, reference.times_s)
     usable, skipped = [], []
@@ -168,9 +184,24 @@ def calibrate_subject(reference: ReferenceMotion, worn: Sequence[Worn]) -> Subje
         identities = identify(
             reference, stated, np.array([rotation for _, rotation in usable]), among=()
         )
+    alone = [fit(some, prior) for some, prior in zip(pairs, priors, strict=True)]
+    changes = [find_change(some, fitted) for some, fitted in zip(pairs, alone, strict=True)]
+    sound = [
+        change is None and (identity is None or not identity.contradicts)
+        for change, identity in zip(changes, identities, strict=True)
+    ]
+    fitted = _Together(reference, kept, pairs, priors, sound, seen, progress).fits(alone)
     sensors, series = [], []
-    for each, some, prior, identity in zip(kept, pairs, priors, identities, strict=True):
-        sensor, drawn = _sensor(reference, each, some, prior, identity)
+    for index, each in enumerate(kept):
+        sensor, drawn = _sensor(
+            reference,
+            each,
+            pairs[index],
+            priors[index],
+            fitted[index],
+            identities[index],
+            changes[index],
+        )
         sensors.append(sensor)
         series.append(drawn)
     return SubjectCalibration(
@@ -304,20 +335,123 @@ def _robust_mean(angle_rad: Float[np.ndarray, " n"], weight: Float[np.ndarray, "
     return float(middle + np.average(apart[near], weights=weight[near]))
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Fitted:
+    """One sensor: all stretches, each fold left out, and even and odd stretches."""
+
+    whole: Fit
+    folds: tuple[Fit | None, ...]
+    halves: tuple[Fit, Fit]
+
+
+def _not_in_fold(block: np.ndarray, fold: int) -> np.ndarray:
+    return block % FOLDS != fold
+
+
+def _in_half(block: np.ndarray, half: int) -> np.ndarray:
+    return block % 2 == half
+
+
+class _Together:
+    """Fits of all sensors; those that are sound hold each other where landmarks are known."""
+
+    def __init__(
+        self,
+        reference: ReferenceMotion,
+        worn: Sequence[Worn],
+        pairs: Sequence[Pairs],
+        priors: Sequence[HeadingPrior],
+        sound: Sequence[bool],
+        seen: SeenLandmarks | None,
+        progress: Callable[[int, int], None] | None,
+    ) -> None:
+        self._reference = reference
+        self._bones = [reference.skeleton.bone(each.settings.bone) for each in worn]
+        self._pairs = pairs
+        self._priors = priors
+        self._sound = sound
+        self._seen = seen
+        self._progress = progress or (lambda done, total: None)
+        if seen is not None:
+            self._sensors = sensor_rotations(worn, seen.times_s)
+
+    def fits(self, alone: Sequence[Fit]) -> list[_Fitted]:
+        """Of all sensors, from where each was fitted alone."""
+        masks: list[Mask] = [partial(_not_in_fold, fold=fold) for fold in range(FOLDS)]
+        masks += [partial(_in_half, half=half) for half in (0, 1)]
+        whole = self._joined(alone, None)
+        parts: list[list[Fit | None]] = []
+        for number, mask in enumerate(masks):
+            self._progress(number + 1, len(masks) + 1)
+            first: list[Fit | None] = []
+            for some, prior in zip(self._pairs, self._priors, strict=True):
+                left = some.where(mask(some.block))
+                enough = (left.block >= 0).sum() >= 3
+                first.append(fit(left, prior) if enough else None)
+            parts.append(self._joined(first, mask, whole))
+        self._progress(len(masks) + 1, len(masks) + 1)
+        result = []
+        for index, fitted in enumerate(whole):
+            assert fitted is not None
+            even, odd = parts[FOLDS][index], parts[FOLDS + 1][index]
+            result.append(
+                _Fitted(
+                    whole=fitted,
+                    folds=tuple(part[index] for part in parts[:FOLDS]),
+                    halves=(even or fitted, odd or fitted),
+                )
+            )
+        return result
+
+    def _joined(
+        self,
+        alone: Sequence[Fit | None],
+        mask: Mask | None,
+        near: Sequence[Fit | None] | None = None,
+    ) -> list[Fit | None]:
+        """The given fits, those of sound sensors replaced; `mask` chooses stretches.
+
+        The search starts at the fits, or at those of `near`.
+        """
+        result = list(alone)
+        group = [
+            index for index, each in enumerate(alone) if each is not None and self._sound[index]
+        ]
+        if self._seen is None or not group:
+            return result
+        pairs, use = [self._pairs[index] for index in group], None
+        if mask is not None:
+            use = mask(held_back(self._seen.times_s, pairs[0]))
+            pairs = [some.where(mask(some.block)) for some in pairs]
+        found = fit_together(
+            self._reference.skeleton,
+            self._seen,
+            [self._bones[index] for index in group],
+            self._sensors[group],
+            pairs,
+            [each for index in group if (each := (near or alone)[index]) is not None],
+            use=use,
+        )
+        for index, fitted in zip(group, found, strict=True):
+            result[index] = fitted
+        return result
+
+
 def _sensor(
     reference: ReferenceMotion,
     worn: Worn,
     pairs: Pairs,
     prior: HeadingPrior,
+    found: _Fitted,
     identity: Identity | None,
+    change: Change | None,
 ) -> tuple[SensorCalibration, tuple[np.ndarray, np.ndarray]]:
-    fitted = fit(pairs, prior)
+    fitted = found.whole
     drifting = fit(pairs, prior, drift_sigma_rad_s=DRIFT_RAD_S)
-    residual_deg = _held_out_deg(pairs, prior)
+    residual_deg = _held_out_deg(pairs, found.folds)
     recorded = pairs.block >= 0
     sigma = np.degrees(fitted.sigma_rad(pairs))
-    held_out = float(np.median(residual_deg))
-    change = find_change(pairs, fitted)
+    held_out = float(np.nanmedian(residual_deg))
     xyzw = Rotation.from_matrix(fitted.bone_from_imu).as_quat(canonical=True)
     verdict, remedy = _verdict(worn, identity, change, held_out, sigma)
     step_s = float(np.median(np.diff(reference.times_s)))
@@ -331,7 +465,7 @@ def _sensor(
         drift_sigma_deg_min=float(np.degrees(np.sqrt(drifting.covariance[4, 4])) * 60),
         sigma_deg=(float(sigma[0]), float(sigma[1]), float(sigma[2])),
         heading_sigma_deg=float(np.degrees(np.sqrt(fitted.covariance[3, 3]))),
-        halves_deg=_halves_deg(pairs, prior),
+        halves_deg=_halves_deg(pairs, found.halves),
         held_out_deg=held_out,
         stated_deg=_stated_deg(worn, pairs),
         share=min(float(recorded.sum()) * step_s / max(reference.duration_s, step_s), 1.0),
@@ -340,23 +474,22 @@ def _sensor(
         verdict=verdict,
         remedy=remedy,
     )
-    return sensor, (pairs.times_s[recorded], residual_deg)
+    judged = np.isfinite(residual_deg)
+    return sensor, (pairs.times_s[recorded][judged], residual_deg[judged])
 
 
-def _held_out_deg(pairs: Pairs, prior: HeadingPrior) -> Float[np.ndarray, " n"]:
+def _held_out_deg(pairs: Pairs, folds: Sequence[Fit | None]) -> Float[np.ndarray, " n"]:
     """Of every recorded instant, with the fit of the folds that its stretch is not in."""
     recorded = pairs.block >= 0
-    residual = np.empty(len(pairs))
-    for fold in range(FOLDS):
+    residual = np.full(len(pairs), np.nan)
+    for fold, left in enumerate(folds):
         out = recorded & (pairs.block % FOLDS == fold)
-        if out.any() and (recorded & ~out).sum() >= 3:
-            left = fit(pairs.where(~out), prior)
+        if left is not None:
             residual[out] = residual_rad(pairs, left.errors(pairs))[out]
     return np.degrees(residual[recorded])
 
 
-def _halves_deg(pairs: Pairs, prior: HeadingPrior) -> float:
-    halves = [fit(pairs.where(pairs.block % 2 == half), prior) for half in (0, 1)]
+def _halves_deg(pairs: Pairs, halves: tuple[Fit, Fit]) -> float:
     apart = halves[0].errors(pairs) - halves[1].errors(pairs)
     return float(np.degrees(np.median(residual_rad(pairs, apart))))
 

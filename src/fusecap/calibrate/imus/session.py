@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fusecap.body.landmarks import LANDMARK_SETS
 from fusecap.calibrate.imus.identify import Identity
+from fusecap.calibrate.imus.joint_centres import MAX_INSTANTS, landmarks_seen
 from fusecap.calibrate.imus.motion import (
     SubjectCalibration,
     Worn,
@@ -21,8 +24,16 @@ from fusecap.errors import InputError
 from fusecap.offline.solve import Progress, solve_session
 from fusecap.sinks.take import Take
 from fusecap.sources.imu_calibration_files import CalibratedImu
-from fusecap.sources.session import Session, SubjectSettings
-from fusecap.sources.session_data import open_imus, open_session
+from fusecap.sources.imu_files.track import ImuTrack
+from fusecap.sources.session import ImuSettings, Session, SubjectSettings
+from fusecap.sources.session_data import (
+    SessionData,
+    open_imus,
+    open_session,
+    session_clocks,
+    with_detections,
+)
+from fusecap.types import Detections
 
 
 def wearers(session: Session) -> list[SubjectSettings]:
@@ -36,15 +47,28 @@ def wearers(session: Session) -> list[SubjectSettings]:
     return found
 
 
-def seen_by_cameras(session: Session, progress: Progress | None = None) -> Take:
+def camera_data(session: Session, progress: Progress | None = None) -> SessionData | None:
+    """What the cameras saw, without sensors; None where keypoints are missing."""
+    session = with_detections(session)
+    if not session.cameras or any(camera.keypoints is None for camera in session.cameras):
+        return None
+    bare = tuple(subject.model_copy(update={"imus": ()}) for subject in session.subjects)
+    return open_session(session.model_copy(update={"subjects": bare}), progress)
+
+
+def seen_by_cameras(
+    session: Session, data: SessionData | None, progress: Progress | None = None
+) -> Take:
     """The session solved from its cameras alone; raises `InputError` where it has none."""
-    if not session.cameras:
+    if data is None and not session.cameras:
         raise InputError(
             f"{session.path}: there are no cameras to see how the sensors move; give a take of the "
             "same motion (--take), or stand in a T-pose and use --from tpose"
         )
-    bare = tuple(subject.model_copy(update={"imus": ()}) for subject in session.subjects)
-    data = open_session(session.model_copy(update={"subjects": bare}), progress)
+    if data is None:
+        raise InputError(
+            f"{session.path}: the cameras' videos have no keypoints yet; run: fusecap detect"
+        )
     solved = solve_session(data, progress=progress)
     if solved.report.interrupted:
         raise KeyboardInterrupt
@@ -66,12 +90,49 @@ def references(
 
 
 def calibrate_from_motion(
-    session: Session, reference: dict[str, ReferenceMotion]
+    session: Session,
+    reference: dict[str, ReferenceMotion],
+    take: Take,
+    data: SessionData | None = None,
+    progress: Progress | None = None,
 ) -> tuple[SubjectCalibration, ...]:
-    """Every subject with sensors; a T-pose that the session states helps where it is sound."""
-    return tuple(
-        calibrate_subject(reference[subject.name], worn_by(subject)) for subject in wearers(session)
-    )
+    """Every subject with sensors; a T-pose that the session states helps where it is sound.
+
+    With `data`, the landmarks that cameras saw hold the sensors together. Raises `InputError`.
+    """
+    found = []
+    for subject in wearers(session):
+        _one_per_bone(subject)
+        seen = None
+        if data is not None and data.landmarks is not None and len(data.rig) > 1:
+            seen = landmarks_seen(
+                data.rig,
+                data.landmarks,
+                take,
+                take.subject(subject.name),
+                _some_instants(take, data),
+            )
+        show = partial(progress, f"sensors of {subject.name}") if progress else None
+        worn = worn_by(session, subject)
+        found.append(calibrate_subject(reference[subject.name], worn, seen, show))
+    return tuple(found)
+
+
+def _some_instants(take: Take, data: SessionData) -> list[Detections]:
+    """Of the cameras' instants those that the take has, spread evenly."""
+    shown = np.isin(data.timestamps_ns, take.timestamps_ns).nonzero()[0]
+    step = max(1, -(-len(shown) // MAX_INSTANTS))
+    return [data.detections(int(instant)) for instant in shown[::step]]
+
+
+def _one_per_bone(subject: SubjectSettings) -> None:
+    bones = [imu.bone for imu in subject.imus]
+    twice = sorted({bone for bone in bones if bones.count(bone) > 1})
+    if twice:
+        raise InputError(
+            f"'{subject.name}' has two [[subject.imu]] on {', '.join(twice)}; a calibration is for "
+            "one sensor per bone. Leave one out, or ask which bones they are on with --identify"
+        )
 
 
 def identify_sensors(
@@ -79,15 +140,15 @@ def identify_sensors(
 ) -> dict[str, tuple[Identity, ...]]:
     """By subject, which of its sensors is on which bone."""
     return {
-        subject.name: identify_subject(reference[subject.name], worn_by(subject))
+        subject.name: identify_subject(reference[subject.name], worn_by(session, subject))
         for subject in wearers(session)
     }
 
 
-def worn_by(subject: SubjectSettings) -> list[Worn]:
+def worn_by(session: Session, subject: SubjectSettings) -> list[Worn]:
     """The subject's sensors with their samples and, where stated, their T-pose."""
     worn = []
-    for settings, track in zip(subject.imus, open_imus(subject), strict=True):
+    for settings, track in _on_session_clock(session, subject):
         tpose = None
         if subject.tpose_s is not None:
             start_s, end_s = subject.tpose_s
@@ -97,11 +158,22 @@ def worn_by(subject: SubjectSettings) -> list[Worn]:
     return worn
 
 
+def _on_session_clock(
+    session: Session, subject: SubjectSettings
+) -> list[tuple[ImuSettings, ImuTrack]]:
+    clocks = session_clocks(session)
+    return [
+        (imu, replace(track, times_s=clocks.imu(subject.name, imu.bone).session_s(track.times_s)))
+        for imu, track in zip(subject.imus, open_imus(subject), strict=True)
+    ]
+
+
 def calibrate_from_tpose(session: Session) -> list[tuple[CalibratedImu, TPose]]:
     """Every sensor of every subject; raises `SessionError` without a T-pose."""
     found = []
     for subject in wearers(session):
-        for settings, track in zip(subject.imus, open_imus(subject), strict=True):
+        _one_per_bone(subject)
+        for settings, track in _on_session_clock(session, subject):
             pose = look_at_tpose(subject, settings, track)
             xyzw = Rotation.from_matrix(pose.bone_from_imu).as_quat(canonical=True)
             imu = CalibratedImu(

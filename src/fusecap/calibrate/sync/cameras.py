@@ -390,7 +390,7 @@ class _Equations:
         slope, right = np.diag(prior), prior * unknown
         gradients, at_s, clusters = [], [], []
         for number, (pair, some, r) in enumerate(zip(pairs, matches, distances, strict=True)):
-            columns, by, weighing = self._derivatives(pair, some, r)
+            columns, by, weighing = self._derivatives(pair, some)
             weight = 1.0 / (1.0 + (r / self.scale_px) ** 2) ** 2
             slope[np.ix_(columns, columns)] += weighing.T @ (weight[:, None] * by)
             right[columns] += weighing.T @ (weight * r)
@@ -409,19 +409,23 @@ class _Equations:
         )
 
     def _derivatives(
-        self, pair: Pair, some: _Matches, r: Float[np.ndarray, " n"]
+        self, pair: Pair, some: _Matches
     ) -> tuple[list[int], Float[np.ndarray, "n q"], Float[np.ndarray, "n q"]]:
         """The unknowns that matter to a pair, dr/d(unknown), and the same with the trends."""
         essential = _essential(self.rig, pair, self.poses)
+        norm = _norm(essential, some)
+        # Where a keypoint is near its line the norm's change does not matter.
+        product = (some.y[:, :, None] * some.x[:, None, :]).reshape(-1, 9)
+        product *= (some.focal_px / norm)[:, None]
         columns, by, weighing = [], [], []
         for side, camera in enumerate(pair):
             for axis in range(6):
                 moved = self.poses.copy()
                 moved[camera, axis] += 1e-5
-                change = (_sampson_px(_essential(self.rig, pair, moved), some) - r) / 1e-5
+                change = (_essential(self.rig, pair, moved) - essential).ravel() / 1e-5
                 columns.append(self.pose_column[camera] + axis)
-                by.append(change)
-                weighing.append(change)
+                by.append(product @ change)
+                weighing.append(by[-1])
             if camera not in self.offset_column:
                 continue
             own_s = (some.first_s, some.second_s)[side] - self.middle_s[camera]

@@ -7,16 +7,18 @@ does not, so that a second run finds what the first one found.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float
+from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
-from fusecap.calibrate.sync.cameras import CameraClocks, synchronise_cameras
-from fusecap.calibrate.sync.curves import Peak
-from fusecap.calibrate.sync.imus import Filmed, ImuClock, Worn, imu_clock
-from fusecap.calibrate.sync.signals import MAX_GAP_S, View, view_of
+from fusecap.calibrate.sync.cameras import CameraClocks, limb_speeds, synchronise_cameras
+from fusecap.calibrate.sync.curves import Curve, Peak
+from fusecap.calibrate.sync.imus import Comparison, Filmed, ImuClock, Worn, unknown_clock
+from fusecap.calibrate.sync.signals import MAX_GAP_S, View, common_smooth_s, view_of
 from fusecap.calibrate.sync.stamp import ERROR_S, Stamp, find_stamp
 from fusecap.errors import CalibrationError, InputError
 from fusecap.geometry.camera import Rig
@@ -45,6 +47,8 @@ SIGNIFICANT = 4.0
 """Standard errors that a drift must differ from zero by to be written."""
 SAME_CLOCK_S = 0.06
 """Sensors that lie within this of each other (or `SIGNIFICANT` standard errors) share a clock."""
+
+PICTURE_STEP_S = 1 / 30
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,6 +90,9 @@ class Synchronisation:
     stamps: dict[str, Stamp]
     """By subject."""
     notes: tuple[str, ...]
+    speeds: dict[str, Float[np.ndarray, "2 t"]]
+    """For pictures, of each camera on a clock that was found: session times [s], and how fast
+    people move [body extents per second]."""
 
     @property
     def complete(self) -> bool:
@@ -107,6 +114,7 @@ def synchronise(
         raise InputError(
             f"{session.path}: one camera and no sensors; there is nothing to synchronise"
         )
+    _check_bones(session, worn)
     session = with_detections(session)
     tracks = open_keypoints(session, progress)
     if not any(len(people) for track in tracks for people in track.people):
@@ -117,18 +125,20 @@ def synchronise(
     notes: list[str] = []
     rig = _rig(session, notes)
     views = []
+    smooth_s = common_smooth_s(tracks)
     for done, track in enumerate(tracks):
         if progress:
             progress("following people", done, len(tracks))
-        views.append(view_of(track, rig[track.name] if rig else None))
+        views.append(view_of(track, rig[track.name] if rig else None, smooth_s))
     if progress:
         progress("following people", len(tracks), len(tracks))
     cameras, rows, clocks = None, [], {}
+    names = tuple(tracks[0].landmarks.landmark_names)
     if len(tracks) > 1:
         cameras = synchronise_cameras(
             rig,
             views,
-            tracks[0].landmarks.landmark_names,
+            names,
             max_offset_s=max_offset_s,
             progress=progress,
         )
@@ -149,7 +159,8 @@ def synchronise(
             if len(tracks) == 1 or track.name in clocks
         ]
         take = _filmed_take(session, synced, progress)
-        _add_imus(session, take, max_offset_s, (rows, imus, found, stamps), progress)
+        into = (rows, imus, found, stamps, notes)
+        _add_imus(session, take, max_offset_s, into, progress)
     reference = views[cameras.reference].name if cameras else None
     return Synchronisation(
         rows=tuple(rows),
@@ -159,7 +170,33 @@ def synchronise(
         imus=tuple(found),
         stamps=stamps,
         notes=tuple(notes),
+        speeds={
+            view.name: _speeds(view, names, clocks[view.name])
+            for view in views
+            if view.name in clocks
+        },
     )
+
+
+def _speeds(view: View, names: Sequence[str], clock: Clock) -> Float[np.ndarray, "2 t"]:
+    own_s = np.arange(view.times_s[0], view.times_s[-1], PICTURE_STEP_S)
+    groups = limb_speeds(view, names, own_s)
+    known = np.isfinite(groups)
+    mean = np.where(known, groups, 0.0).sum(1) / np.maximum(known.sum(1), 1)
+    return np.stack([clock.session_s(own_s), np.where(known.any(1), mean**2, np.nan)])
+
+
+def _check_bones(session: Session, worn: Sequence[SubjectSettings]) -> None:
+    """A sync file names a sensor by its bone."""
+    for subject in worn:
+        bones = [imu.bone for imu in subject.imus]
+        for bone in dict.fromkeys(bones):
+            if bones.count(bone) > 1:
+                raise InputError(
+                    f"{session.path}: '{subject.name}' has {bones.count(bone)} sensors on "
+                    f"'{bone}', expected one per bone; the clocks of both could not be told apart "
+                    "in sync.toml: leave one out, or state the bone it is really on"
+                )
 
 
 def _rig(session: Session, notes: list[str]) -> Rig | None:
@@ -330,25 +367,34 @@ def _filmed_take(
     return solve_session(data, progress=progress).take
 
 
-Found = tuple[list[Row], dict[str, dict[str, Clock]], list[ImuClock], dict[str, Stamp]]
+Found = tuple[list[Row], dict[str, dict[str, Clock]], list[ImuClock], dict[str, Stamp], list[str]]
 
 
 def _add_imus(
     session: Session, take: Take, max_offset_s: float, into: Found, progress: Progress | None
 ) -> None:
-    rows, clocks, found, stamps = into
+    rows, clocks, found, stamps, notes = into
     people = [_filmed(take, index) for index in range(len(take.subject_names))]
     worn = [subject for subject in session.subjects if subject.imus]
-    for done, subject in enumerate(worn):
+    tracks = [open_imus(subject) for subject in worn]
+    sensors = [
+        [_worn(imu.bone, track) for imu, track in zip(subject.imus, some, strict=True)]
+        for subject, some in zip(worn, tracks, strict=True)
+    ]
+    wearing = _wearers(session, worn, sensors, people, _starts_m(take), max_offset_s, notes)
+    for done, (subject, some) in enumerate(zip(worn, tracks, strict=True)):
         if progress:
             progress("comparing sensors", done, len(worn))
-        tracks = open_imus(subject)
-        named = [person for person in people if person.name == subject.name] or people
-        stamp = _stamp(take, subject, tracks, named[0].name) if named else None
+        person = wearing[done]
+        if person is None:
+            rows.append(_unseen(subject))
+            found.append(unknown_clock(sensors[done], ""))
+            continue
+        stamp = _stamp(take, subject, some, person.name)
         if stamp is not None:
             stamps[subject.name] = stamp
         near_s = stamp.offset_s if stamp else None
-        for clock in _subject_clocks(subject, tracks, named, max_offset_s, near_s):
+        for clock in _subject_clocks(subject, some, sensors[done], person, max_offset_s, near_s):
             row = _imu_row(subject, clock, stamp, max_offset_s)
             rows.append(row)
             found.append(clock)
@@ -357,6 +403,80 @@ def _add_imus(
                     clocks.setdefault(subject.name, {})[bone] = written
     if progress:
         progress("comparing sensors", len(worn), len(worn))
+
+
+def _starts_m(take: Take) -> dict[str, tuple[float, float]]:
+    """x, z where each person is first tracked."""
+    starts = {}
+    for index, name in enumerate(take.subject_names):
+        first = int(np.argmax(take.tracked[index]))
+        x, _, z = take.bone_position_in_world_m[index, first, 0]
+        starts[name] = (float(x), float(z))
+    return starts
+
+
+def _wearers(
+    session: Session,
+    worn: Sequence[SubjectSettings],
+    sensors: Sequence[Sequence[Worn]],
+    people: Sequence[Filmed],
+    starts_m: Mapping[str, tuple[float, float]],
+    max_offset_s: float,
+    notes: list[str],
+) -> list[Filmed | None]:
+    """Whom of the video each subject is; nobody is two of them.
+
+    A subject that `start_m` places, or the only one, has its name in the video. The others are
+    assigned together, such that their sensors fit best.
+    """
+    by_name = {person.name: person for person in people}
+    placed = [
+        by_name.get(subject.name)
+        if subject.start_m is not None or len(session.subjects) == 1
+        else None
+        for subject in worn
+    ]
+    taken = [person.name for person in placed if person is not None]
+    free = [person for person in people if person.name not in taken]
+    open_ = [index for index, person in enumerate(placed) if person is None]
+    if not (free and open_):
+        return placed
+    fits = np.array(
+        [
+            [
+                Comparison(sensors[i], person, max_offset_s=max_offset_s)
+                .clock(range(len(sensors[i])))
+                .correlation
+                for person in free
+            ]
+            for i in open_
+        ]
+    )
+    for row, column in zip(*linear_sum_assignment(-fits), strict=True):
+        subject, person = worn[open_[row]], free[column]
+        placed[open_[row]] = person
+        if person.name != subject.name:
+            x, z = starts_m[person.name]
+            notes.append(
+                f"the sensors of '{subject.name}' fit the person whom the video calls "
+                f"'{person.name}'; add start_m = [{x:.1f}, {z:.1f}] to '{subject.name}'"
+            )
+    return placed
+
+
+def _unseen(subject: SubjectSettings) -> Row:
+    return _row(
+        "imu",
+        subject.name,
+        tuple(imu.bone for imu in subject.imus),
+        float("nan"),
+        float("nan"),
+        None,
+        None,
+        (),
+        "not found",
+        "the video shows nobody who could wear these sensors; check start_m and max_subjects",
+    )
 
 
 def _filmed(take: Take, index: int) -> Filmed:
@@ -381,46 +501,61 @@ def _worn(bone: str, track: ImuTrack) -> Worn:
 def _subject_clocks(
     subject: SubjectSettings,
     tracks: Sequence[ImuTrack],
-    people: Sequence[Filmed],
+    sensors: Sequence[Worn],
+    person: Filmed,
     max_offset_s: float,
     near_s: float | None,
 ) -> list[ImuClock]:
     """One clock for all sensors of a subject, but for those that clearly have another.
 
-    Sensors of one recorder (packet counter, or one file) stay together. Where the session's names
-    are not found in the video, the person who fits best is taken.
+    Sensors of one recorder (packet counter, or one file) stay together.
     """
-    sensors = [_worn(imu.bone, t) for imu, t in zip(subject.imus, tracks, strict=True)]
-    if not people:
-        return []
-
-    def clock(some: Sequence[Worn], near_s: float | None = near_s) -> ImuClock:
-        each = [
-            imu_clock(some, person, max_offset_s=max_offset_s, near_s=near_s) for person in people
-        ]
-        return max(each, key=lambda c: c.correlation)
-
-    together = clock(sensors)
+    compared = Comparison(sensors, person, max_offset_s=max_offset_s)
+    together = compared.clock(range(len(sensors)), near_s=near_s)
     recorders: dict[str, list[int]] = {}
     for index, (imu, track) in enumerate(zip(subject.imus, tracks, strict=True)):
         key = f"clock {track.clock.period_s}" if track.clock else str(imu.file)
         recorders.setdefault(key, []).append(index)
     if len(recorders) < 2:
         return [together]
-    alone = {key: clock([sensors[i] for i in group]) for key, group in recorders.items()}
+    alone = {key: compared.clock(group, near_s=near_s) for key, group in recorders.items()}
     sure = {k: c for k, c in alone.items() if c.peak is not None and c.peak.distinct}
     if len(sure) < 2:
         return [together]
-    middle_s = float(np.median([c.offset_s for c in sure.values()]))
-    apart = [
-        key
-        for key, c in sure.items()
-        if abs(c.offset_s - middle_s) > max(SAME_CLOCK_S, SIGNIFICANT * c.error_s)
-    ]
-    if not apart:
+    groups = _same_clocks(sure)
+    if len(groups) < 2:
         return [together]
-    rest = [i for key, group in recorders.items() if key not in apart for i in group]
-    return [clock([sensors[i] for i in rest]), *(alone[key] for key in apart)]
+    for key, unsure in alone.items():
+        if key not in sure:
+            cost = [_cost_at(unsure.curve, sure[group[0]].offset_s) for group in groups]
+            groups[int(np.argmin(cost))].append(key)
+    members = [sorted(i for key in group for i in recorders[key]) for group in groups]
+    return [compared.clock(group, near_s=near_s) for group in members]
+
+
+def _cost_at(curve: Curve | None, offset_s: float) -> float:
+    """Infinite where the curve does not reach."""
+    if curve is None:
+        return float("inf")
+    cost = curve.mean[int(np.argmin(np.abs(curve.shifts_s - offset_s)))]
+    return float(cost) if np.isfinite(cost) else float("inf")
+
+
+def _same_clocks(sure: Mapping[str, ImuClock]) -> list[list[str]]:
+    """Recorders by clock, the largest group first."""
+    left = sorted(sure, key=lambda key: sure[key].offset_s)
+    groups = []
+    while left:
+        middle_s = sure[left[len(left) // 2]].offset_s
+        group = [
+            key
+            for key in left
+            if abs(sure[key].offset_s - middle_s)
+            <= max(SAME_CLOCK_S, SIGNIFICANT * sure[key].error_s)
+        ]
+        groups.append(group)
+        left = [key for key in left if key not in group]
+    return sorted(groups, key=len, reverse=True)
 
 
 def _stamp(

@@ -18,13 +18,18 @@ from scipy.spatial.transform import Rotation
 
 from fusecap.geometry.camera import Camera
 from fusecap.sources.keypoint_files import KeypointTrack
+from fusecap.sources.synchronizer import MAX_GAP_PERIODS
 
 SMOOTH_S = 0.035
 """Standard deviation of the kernel: at 3 Hz it leaves 80 % of a signal."""
 TREND_S = 0.09
 """The same of the velocities that weigh keypoints: those of a keypoint that only jitters vanish."""
+SMOOTH_PERIODS = 0.5
+"""Where a camera is so slow that this many of its frame periods are more than `SMOOTH_S`, they are
+the kernel of all."""
 MAX_GAP_S = 0.1
-"""Samples further apart are not interpolated between."""
+"""Samples further apart are not interpolated between, but for cameras of which `MAX_GAP_PERIODS`
+frame periods are longer."""
 MIN_CONFIDENCE = 0.3
 
 _REACH = 2.5
@@ -70,7 +75,7 @@ class View:
         second = np.minimum(first + 1, len(self.row_s) - 1)
         step_s = self.row_s[second] - self.row_s[first]
         linked = (first >= 0) & (second > first) & (self.tracklet[second] == self.tracklet[first])
-        linked &= (step_s > 0) & (step_s <= MAX_GAP_S)
+        linked &= (step_s > 0) & (step_s <= _max_gap_s(self.times_s))
         h = np.where(linked, step_s, np.nan)[:, :, None, None]
         u = (times_s[:, None] - self.row_s[first])[:, :, None, None] / h
         p, q = self.point[first], self.point[second]
@@ -91,11 +96,28 @@ class View:
     @property
     def period_s(self) -> float:
         """Median time between frames."""
-        return float(np.median(np.diff(self.times_s))) if len(self.times_s) > 1 else MAX_GAP_S
+        return _period_s(self.times_s)
 
 
-def view_of(track: KeypointTrack, camera: Camera | None) -> View:
-    """A camera's keypoints as a view, undistorted where `camera` is known."""
+def _period_s(times_s: Float[np.ndarray, " f"]) -> float:
+    return float(np.median(np.diff(times_s))) if len(times_s) > 1 else MAX_GAP_S
+
+
+def _max_gap_s(times_s: Float[np.ndarray, " f"]) -> float:
+    return max(MAX_GAP_S, MAX_GAP_PERIODS * _period_s(times_s))
+
+
+def common_smooth_s(tracks: Sequence[KeypointTrack]) -> float:
+    """Standard deviation of the kernel [s] that suits every camera of a session."""
+    slowest_s = max(_period_s(track.times_s) for track in tracks)
+    return max(SMOOTH_S, SMOOTH_PERIODS * slowest_s)
+
+
+def view_of(track: KeypointTrack, camera: Camera | None, smooth_s: float = SMOOTH_S) -> View:
+    """A camera's keypoints as a view, undistorted where `camera` is known.
+
+    Views that are compared share one `smooth_s`.
+    """
     tracklet, slot = _linked(track.times_s, track.people)
     frame = np.repeat(np.arange(len(track.people)), [len(people) for people in track.people])
     order = np.lexsort((frame, tracklet))
@@ -116,11 +138,11 @@ def view_of(track: KeypointTrack, camera: Camera | None) -> View:
             continue
         rows = slice(start, end)
         flat = point[rows].reshape(end - start, -1)
-        value, slope = smoothed(row_s[rows], flat, row_s[rows], SMOOTH_S)
+        value, slope = smoothed(row_s[rows], flat, row_s[rows], smooth_s)
         known = np.isfinite(flat)
         smooth[rows] = np.where(known, value, np.nan).reshape(point[rows].shape)
         velocity[rows] = np.where(known, slope, np.nan).reshape(point[rows].shape)
-        _, slope = smoothed(row_s[rows], flat, row_s[rows], TREND_S)
+        _, slope = smoothed(row_s[rows], flat, row_s[rows], max(TREND_S, smooth_s))
         trend[rows] = np.where(known, slope, np.nan).reshape(point[rows].shape)
     row = np.full((len(track.people), int(slot.max()) + 1 if len(slot) else 1), -1)
     row[frame, slot] = np.arange(len(frame))
@@ -152,9 +174,10 @@ def _linked(
     slots: list[int] = []
     last: list[tuple[int, int]] = []
     count = 0
+    max_gap_s = _max_gap_s(times_s)
     for frame, now in enumerate(people):
         current: list[tuple[int, int] | None] = [None] * len(now)
-        if frame and last and len(now) and times_s[frame] - times_s[frame - 1] <= MAX_GAP_S:
+        if frame and last and len(now) and times_s[frame] - times_s[frame - 1] <= max_gap_s:
             for before, after in _same_people(people[frame - 1], now):
                 current[after] = last[before]
         taken = {each[1] for each in current if each}

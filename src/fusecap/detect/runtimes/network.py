@@ -10,10 +10,6 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float32
 
-from fusecap.errors import InputError, nearest
-
-RUNTIMES = ("auto", "onnxruntime", "openvino")
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tensor:
@@ -52,51 +48,6 @@ class Network(Protocol):
     def run(self, batch: Float32[np.ndarray, "n c h w"]) -> dict[str, np.ndarray]:
         """Outputs by name, rows as in the batch; one run where the network takes batches."""
         ...
-
-
-def open_network(path: Path, runtime: str = "auto", threads: int | None = None) -> Network:
-    """Load a network; `threads` None: as many as there are cores.
-
-    "auto" takes .xml to OpenVINO and .onnx to ONNX Runtime, or to OpenVINO where that alone is
-    installed. Raises `InputError` for a missing or broken file and where the runtime is missing.
-    """
-    from fusecap.detect.runtimes import onnxruntime, openvino
-
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; expected a network (.onnx or OpenVINO .xml)")
-    if runtime_for(path, runtime) == "onnxruntime":
-        return onnxruntime.OnnxNetwork(path, threads)
-    return openvino.OpenVinoNetwork(path, threads)
-
-
-def runtime_for(path: Path | str, runtime: str = "auto") -> str:
-    """Which runtime reads a file of this name: "onnxruntime" or "openvino".
-
-    Raises `InputError` where none does, or where it is not installed.
-    """
-    from fusecap.detect.runtimes import onnxruntime, openvino
-
-    if runtime not in RUNTIMES:
-        raise InputError(f"no runtime '{runtime}'{nearest(runtime, RUNTIMES)}")
-    path = Path(path)
-    if path.suffix not in (".onnx", ".xml"):
-        raise InputError(f"{path}: expected a network, .onnx or OpenVINO .xml")
-    if path.suffix == ".xml" and runtime == "onnxruntime":
-        raise InputError(f"{path}: ONNX Runtime cannot read OpenVINO files; set runtime openvino")
-    if runtime == "auto":
-        by_openvino = openvino.installed() and not onnxruntime.installed()
-        runtime = "openvino" if path.suffix == ".xml" or by_openvino else "onnxruntime"
-    if runtime == "onnxruntime" and not onnxruntime.installed():
-        raise InputError(
-            f"{path.name} needs ONNX Runtime, which is not installed; "
-            "run: pip install 'fusecap[detect]'"
-        )
-    if runtime == "openvino" and not openvino.installed():
-        raise InputError(
-            f"{path.name} needs OpenVINO, which is not installed; "
-            "run: pip install 'fusecap[openvino]'"
-        )
-    return runtime
 
 
 def file_identity(path: Path, runtime: str) -> str:

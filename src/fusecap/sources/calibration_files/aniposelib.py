@@ -19,7 +19,6 @@ and takes tables in alphabetical order, so their numbers have as many digits as 
 
 from __future__ import annotations
 
-import json
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
@@ -30,6 +29,7 @@ from scipy.spatial.transform import Rotation
 from fusecap.errors import CalibrationError
 from fusecap.geometry.camera import Camera
 from fusecap.sources.calibration_files import fields
+from fusecap.sources.toml_text import quoted
 
 
 def read(path: Path) -> list[Camera]:
@@ -66,7 +66,7 @@ def dumps(cameras: Sequence[Camera], *, notes: Sequence[str] = (), nested: bool 
         tables.append(
             f"[{key}]\n"
             + (f"cam_id = {index}\n" if nested else "")
-            + f"name = {json.dumps(camera.name, ensure_ascii=False)}\n"
+            + f"name = {quoted(camera.name)}\n"
             f"size = {list(camera.size_px)}\n"
             f"matrix = {camera.matrix.tolist()}\n"
             f"distortions = {camera.distortion.tolist()}\n"
