@@ -10,6 +10,7 @@ from fusecap.body.shape import BodyShape
 from fusecap.body.skeleton import PAPER21
 from fusecap.calibrate.offsets import (
     MAX_MOVE,
+    _assigned,
     calibrate_session,
     measure_offsets,
     median_offsets,
@@ -24,6 +25,7 @@ from fusecap.evaluate.score import score_take
 from fusecap.evaluate.simulated_session import write_session
 from fusecap.evaluate.simulated_solve import solve_simulation
 from fusecap.evaluate.simulator import Person, camera_ring, placed, simulate
+from fusecap.geometry.camera import Rig
 from fusecap.solve.body_measure import BodyMeasure
 from fusecap.sources.offset_files import offsets_toml, read_offsets
 from fusecap.sources.session import load_session
@@ -118,6 +120,18 @@ def test_keypoints_of_others_do_not_count(scene):
     turned = [replace(d, people=tuple(p[::-1] for p in d.people)) for d in scene.detections]
     again = measure_offsets(scene.rig, BODY25, scene.truth, turned)
     assert np.array_equal(alone.in_bone, again.in_bone, equal_nan=True)
+
+
+def test_person_beside_the_camera_is_not_taken_for_one_in_front_of_it(scene):
+    """Landmarks in the camera's own plane project to millions of pixels, whatever is there."""
+    camera = scene.rig.cameras[0]
+    beside = np.tile([0.01, 0.01, 1e-3], (len(BODY25.landmark_names), 1))
+    beside[0] = [0.3, 0.3, 1e-3]
+    landmarks = (beside - camera.translation) @ camera.rotation
+    (in_front,) = camera_seen = scene.detections[0].people[0][:1]
+    moment = replace(scene.detections[0], people=(camera_seen,))
+    assigned = _assigned(Rig(cameras=(camera,)), landmarks[None], moment)
+    assert not (assigned[..., 2] > 0).any() and (in_front[:, 2] > 0).any()
 
 
 def test_landmark_seen_too_rarely_keeps_its_default(scene):

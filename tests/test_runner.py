@@ -28,7 +28,7 @@ def test_cells_are_computed_once_and_returned_in_order(tmp_path):
     log, folder = tmp_path / "log", tmp_path / "cells"
     log.mkdir()
     cells = [Square(number=n, log=str(log)) for n in (3, 1, 2, 3)]
-    seen = []
+    seen, environment = [], dict(os.environ)
     outcomes = run_cells(
         cells,
         square,
@@ -40,7 +40,7 @@ def test_cells_are_computed_once_and_returned_in_order(tmp_path):
     assert all(o.result and o.result["threads"] == 1 for o in outcomes)
     assert starts(log) == [1, 2, 3]
     assert seen == [(1, 3), (2, 3), (3, 3)]
-    assert "OMP_NUM_THREADS" not in os.environ
+    assert dict(os.environ) == environment
 
     again = run_cells(cells, square, folder=folder, workers=2)
     assert [o.result for o in again] == [o.result for o in outcomes]

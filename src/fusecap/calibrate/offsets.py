@@ -455,7 +455,8 @@ def _assigned(
             inside = np.isfinite(projected[:, 0])
             if not inside.any():
                 continue
-            size = np.linalg.norm(np.ptp(projected[inside], axis=0))
+            # Someone beside the camera's plane projects to millions of pixels: the image bounds it.
+            size = min(np.linalg.norm(np.ptp(projected[inside], axis=0)), np.hypot(*lens.size_px))
             for index, keypoints in enumerate(seen):
                 shared = inside & (keypoints[:, 2] > 0)
                 if shared.any():

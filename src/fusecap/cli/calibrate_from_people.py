@@ -129,8 +129,8 @@ def _print_report(found: PeopleCalibration) -> None:
     refined = f"poses and {', '.join(found.refined)}" if found.refined else "poses"
     feet = f"feet {1e3 * found.feet_m:+.0f} mm from the floor"
     console.print(
-        f"  {refined}; scale {found.scale:.4f}, from {found.scale_from}; people walked "
-        f"{found.walked_m[0]:.1f} x {found.walked_m[1]:.1f} m; "
+        f"  {refined}; scale {found.scale:.4f}, from {found.scale_from}; people were seen over "
+        f"{found.walked_m[0]:.1f} x {found.walked_m[1]:.1f} m of floor; "
         f"{feet if found.feet_m == found.feet_m else 'the keypoints have no heels or toes'}",
         soft_wrap=True,
     )

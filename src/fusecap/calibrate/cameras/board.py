@@ -51,6 +51,10 @@ _KEYS = (
     "inverted",
     "legacy",
 )
+_SEARCHES = (
+    cv2.CALIB_CB_NORMALIZE_IMAGE,
+    cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE,
+)
 _SEARCH_PX = 1000
 """Longer side of the image in which a checkerboard is searched."""
 _UNTIL = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
@@ -384,8 +388,13 @@ def _chessboard_corners(grey: np.ndarray, size: tuple[int, int]) -> np.ndarray |
     small = grey
     if shrink > 1:
         small = cv2.resize(grey, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA)
-    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
-    found, rough = cv2.findChessboardCornersSB(small, size, flags=flags)
+    found, rough = False, np.empty(0)
+    for flags in _SEARCHES:
+        # The search draws lots, and finds or misses a board by them.
+        cv2.setRNGSeed(0)
+        found, rough = cv2.findChessboardCornersSB(small, size, flags=flags)
+        if found:
+            break
     if not found:
         return None
     rough = (rough.reshape(-1, 2) + 0.5) * shrink - 0.5

@@ -382,7 +382,7 @@ def _verdict(found: Intrinsics) -> tuple[str, tuple[str, ...]]:
         1 - _GOOD_COVERAGE,
         1 - _POOR_COVERAGE,
         f"the board covered {100 * found.coverage:.0f} % of the image: record it also near the "
-        f"{' and '.join(empty) or 'edges'}",
+        f"{', '.join(empty) or 'edges'}",
     )
     mark(
         -found.tilt_deg,

@@ -59,7 +59,7 @@ def check_rig(rig: Rig, *, floor: bool = True) -> list[Finding]:
                 severity="warning",
                 where="calibration",
                 found="the cameras hang upside down",
-                remedy='check up in [session]: "y", "z" or "-y" of the calibration\'s world',
+                remedy='check the up axis, "y", "z" or "-y": up under [session], --up of commands',
             )
         )
     low = [name for name, centre in centres.items() if centre[1] < BELOW_FLOOR_M]
@@ -69,7 +69,8 @@ def check_rig(rig: Rig, *, floor: bool = True) -> list[Finding]:
                 severity="warning",
                 where=f"{len(low)} of {len(rig)} cameras ({', '.join(low[:5])})",
                 found=f"lie up to {-min(centres[name][1] for name in low):.2f} m below the floor",
-                remedy="check up in [session], put the origin on the floor, or set floor = false",
+                remedy="check the up axis (up under [session]), put the origin on the floor "
+                "(fusecap calibrate world), or set floor = false",
             )
         )
     if len(rig) > 1 and not _look_at_each_other(rig):
