@@ -76,7 +76,7 @@ def demo(
         console.print(f"  orientation error  {_spread(score.orientation_error_deg)} deg")
         console.print(
             f"  people             {score.subjects} subjects, {score.identity_switches} identity "
-            f"switches, {100 * score.found_share:.1f} % of their frames found"
+            f"switches, {100 * score.found_share:.1f} % of frames found"
         )
         print_speed(solved)
     finish(solved, files, as_json)
