@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -48,7 +47,5 @@ def plot_bodies(bodies: Sequence[MeasuredBody], path: Path) -> None:
         axes.set_title(f"{body.name}, {body.instants} instants")
         axes.grid(axis="x", alpha=0.3)
         axes.legend(fontsize=8)
-    png = io.BytesIO()
-    figure.savefig(png, dpi=90, format="png")
     with written_whole(path) as file:
-        file.write(png.getvalue())
+        figure.savefig(file, dpi=90, format="png")

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from fusecap.sources.session import Session
 
 EXAMPLE = "Example: fusecap detect recordings/duo --overlay"
-RUNTIMES = ("auto", "onnxruntime", "openvino")
 FEW_PEOPLE_SHARE = 0.05
 """Of a camera's frames; fewer with people are worth a warning."""
 
@@ -55,6 +54,7 @@ def detect(
 ) -> None:
     """Find everyone's keypoints in videos, as OpenPose JSON; goes on where it was stopped."""
     from fusecap.detect.build import build_detector
+    from fusecap.detect.runtimes.choice import RUNTIMES
     from fusecap.offline.detect import (
         detect_videos,
         detector_options,

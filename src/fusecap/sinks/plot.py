@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -37,10 +36,8 @@ def plot_take(take: Take, frames: Sequence[int], path: Path | str) -> None:
             _dress(ax, view, f"{take.time_s[frame]:.2f} s, {title}")
         if row[0].get_legend_handles_labels()[0]:
             row[0].legend(loc="upper right", fontsize=8)
-    png = io.BytesIO()
-    figure.savefig(png, dpi=80, format="png")
     with written_whole(Path(path)) as file:
-        file.write(png.getvalue())
+        figure.savefig(file, dpi=80, format="png")
 
 
 def _draw(

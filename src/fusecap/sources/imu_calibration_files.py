@@ -15,7 +15,6 @@ The values come before those of the session's [[subject.imu]] tables.
 from __future__ import annotations
 
 import sys
-import tomllib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from fusecap.errors import InputError, nearest
-from fusecap.sources.toml_text import quoted
+from fusecap.sources.toml_text import quoted, read_written
 
 FORMAT = "fusecap imu calibration 1"
 _KEYS = ("format", "origin", "imu")
@@ -64,17 +63,7 @@ def imu_calibration_toml(imus: Iterable[CalibratedImu], *, origin: str) -> str:
 def read_imu_calibration(path: Path | str) -> tuple[CalibratedImu, ...]:
     """The sensors of a file; raises `InputError`."""
     path = Path(path)
-    try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from None
-    if data.get("format") != FORMAT:
-        raise InputError(
-            f'{path}: format is {data.get("format")!r}, expected "{FORMAT}"; write the file with: '
-            "fusecap calibrate imu"
-        )
+    data = read_written(path, FORMAT, "fusecap calibrate imu")
     _only_known(path, "", data, _KEYS)
     tables = data.get("imu", [])
     if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):

@@ -15,8 +15,6 @@ Landmarks that are not listed keep their defaults.
 
 from __future__ import annotations
 
-import json
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -25,6 +23,7 @@ import numpy as np
 
 from fusecap.body.landmarks import LANDMARKS, LandmarkOffsets, LandmarkSet, Offset
 from fusecap.errors import InputError, nearest
+from fusecap.sources.toml_text import quoted, read_written
 
 FORMAT = "fusecap landmark offsets 1"
 MAX_FRACTION = 0.25
@@ -41,32 +40,22 @@ def offsets_toml(landmarks: LandmarkSet, *, origin: str) -> str:
     lines = [
         "# Where keypoints lie on the body: fractions of stature in the frames of their bones",
         "# (x to the subject's left, y up, z forward in the rest pose).",
-        f"format = {_text(FORMAT)}",
-        f"landmark_set = {_text(landmarks.name)}",
-        f"origin = {_text(origin)}",
+        f"format = {quoted(FORMAT)}",
+        f"landmark_set = {quoted(landmarks.name)}",
+        f"origin = {quoted(origin)}",
         "",
         "[everyone]",
         *_rows(dict(zip(landmarks.landmark_names, landmarks.fractions.tolist(), strict=True))),
     ]
     for subject, offsets in (landmarks.offsets or LandmarkOffsets()).subjects.items():
-        lines += ["", f"[subject.{_text(subject)}]", *_rows(offsets)]
+        lines += ["", f"[subject.{quoted(subject)}]", *_rows(offsets)]
     return "\n".join(lines) + "\n"
 
 
 def read_offsets(path: Path | str, landmark_set: str) -> LandmarkOffsets:
     """The offsets in a file, which must be of this landmark set; raises `InputError`."""
     path = Path(path)
-    try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from None
-    if data.get("format") != FORMAT:
-        raise InputError(
-            f'{path}: format is {data.get("format")!r}, expected "{FORMAT}"; write the file with: '
-            "fusecap calibrate offsets"
-        )
+    data = read_written(path, FORMAT, "fusecap calibrate offsets")
     for key in data:
         if key not in _KEYS:
             raise InputError(f"{path}: unknown key '{key}'{nearest(key, _KEYS)}")
@@ -117,8 +106,3 @@ def _rows(offsets: Mapping[str, Any]) -> list[str]:
         f"{name} = [{', '.join(f'{value + 0.0:.5f}' for value in offset)}]"
         for name, offset in offsets.items()
     ]
-
-
-def _text(value: str) -> str:
-    """A TOML string; JSON's escapes are TOML's."""
-    return json.dumps(value, ensure_ascii=False)

@@ -15,7 +15,6 @@ offset_s = -1.25000
 from __future__ import annotations
 
 import sys
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from fusecap.errors import InputError, nearest
-from fusecap.sources.toml_text import quoted
+from fusecap.sources.toml_text import quoted, read_written
 
 FORMAT = "fusecap sync 1"
 MAX_DRIFT_PPM = 10_000.0
@@ -82,17 +81,7 @@ def sync_toml(clocks: Clocks, *, origin: str) -> str:
 def read_sync(path: Path | str) -> Clocks:
     """The clocks in a file; raises `InputError`."""
     path = Path(path)
-    try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from None
-    if data.get("format") != FORMAT:
-        raise InputError(
-            f'{path}: format is {data.get("format")!r}, expected "{FORMAT}"; write the file with: '
-            "fusecap calibrate sync"
-        )
+    data = read_written(path, FORMAT, "fusecap calibrate sync")
     for key in data:
         if key not in _KEYS:
             raise InputError(f"{path}: unknown key '{key}'{nearest(key, _KEYS)}")

@@ -32,7 +32,12 @@ from fusecap.calibrate.cameras.bundle_adjustment import (
     residuals_px,
     stack_views,
 )
-from fusecap.calibrate.cameras.robust import outlying, robust_scale_px, view_rms_px
+from fusecap.calibrate.cameras.robust import (
+    RAYLEIGH_MEDIAN,
+    outlying,
+    robust_scale_px,
+    view_rms_px,
+)
 from fusecap.errors import CalibrationError
 from fusecap.geometry.camera import Camera
 from fusecap.geometry.projection_derivatives import PARAMETERS
@@ -212,7 +217,7 @@ def _fit(start: _Fit, shots: Sequence[Shot], board: Board, model: str) -> _Fit:
             break
         kept = [i for i, is_bad in zip(kept, bad, strict=True) if not is_bad]
     errors = np.linalg.norm(residuals_px(result.cameras, result.boards, corners), axis=1)
-    sigma = float(np.nanmedian(errors)) / 1.1774
+    sigma = float(np.nanmedian(errors)) / RAYLEIGH_MEDIAN
     return _Fit(
         camera=camera,
         boards=boards,

@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
+from fusecap.calibrate.cameras.robust import RAYLEIGH_MEDIAN
 from fusecap.geometry.camera import Camera, Rig
 from fusecap.geometry.projection_derivatives import PARAMETERS, moved, projection_derivatives
 
@@ -39,8 +40,6 @@ STEPS_ON_THE_WAY = 4
 SETTLED = 1e-4
 """Share of the cost, or of a hundredth of what noise alone would cost, by which a step must lower
 it; an adjustment ends with the first that does not."""
-_RAYLEIGH_MEDIAN = 1.1774
-"""Median length of a 2D vector whose coordinates are normal with sigma 1."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -409,7 +408,7 @@ def _sigma_px(state: State, evidence: Evidence) -> float:
         return MIN_SIGMA_PX
     measured = 2 * len(used)
     left = max(measured - 3 * int(np.isfinite(state.points[:, :, 0]).sum()), 0.1 * measured)
-    sigma = float(np.median(used)) / _RAYLEIGH_MEDIAN * float(np.sqrt(measured / left))
+    sigma = float(np.median(used)) / RAYLEIGH_MEDIAN * float(np.sqrt(measured / left))
     return max(sigma, MIN_SIGMA_PX)
 
 

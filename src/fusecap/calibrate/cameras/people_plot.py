@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +44,5 @@ def plot_residuals(found: PeopleCalibration, path: Path) -> None:
             ax.set_ylabel("down [px]", fontsize=8)
             ax.tick_params(labelsize=7)
     figure.suptitle("Keypoints about their triangulated landmarks, held-out instants", fontsize=11)
-    png = io.BytesIO()
-    figure.savefig(png, dpi=90, format="png")
     with written_whole(path) as file:
-        file.write(png.getvalue())
+        figure.savefig(file, dpi=90, format="png")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -411,10 +410,8 @@ def _draw_rig(ax: Axes, solution: Solution) -> None:
 
 
 def _save(figure: Figure, path: Path) -> None:
-    png = io.BytesIO()
-    figure.savefig(png, dpi=90, format="png")
     with written_whole(path) as file:
-        file.write(png.getvalue())
+        figure.savefig(file, dpi=90, format="png")
 
 
 def _rms(errors: Sequence[np.ndarray]) -> float:

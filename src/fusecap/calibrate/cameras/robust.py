@@ -10,6 +10,8 @@ from jaxtyping import Bool, Float, Int
 from fusecap.calibrate.cameras.bundle_adjustment import Corners, residuals_px
 from fusecap.geometry.camera import Camera
 
+RAYLEIGH_MEDIAN = 1.1774
+"""Median length of a 2D vector whose coordinates are normal with sigma 1."""
 ROBUST_SIGMAS = 3.0
 """Huber's loss turns at this many standard deviations of a corner's error, per axis."""
 MIN_ROBUST_PX = 0.3
@@ -20,8 +22,8 @@ OUTLIER_PX = 2.0
 
 
 def robust_scale_px(errors: Float[np.ndarray, " n"]) -> float:
-    """Where Huber's loss turns, from corners' distances: their median is 1.1774 sigma."""
-    return max(MIN_ROBUST_PX, ROBUST_SIGMAS * float(np.nanmedian(errors)) / 1.1774)
+    """Where Huber's loss turns, from corners' distances."""
+    return max(MIN_ROBUST_PX, ROBUST_SIGMAS * float(np.nanmedian(errors)) / RAYLEIGH_MEDIAN)
 
 
 def view_rms_px(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +41,5 @@ def plot_residuals(found: SubjectCalibration, path: Path) -> None:
     for ax in axes[max(0, len(found.sensors) - _COLUMNS) : len(found.sensors)]:
         ax.set_xlabel("s")
         ax.tick_params(labelbottom=True)
-    png = io.BytesIO()
-    figure.savefig(png, dpi=80, format="png")
     with written_whole(path) as file:
-        file.write(png.getvalue())
+        figure.savefig(file, dpi=80, format="png")

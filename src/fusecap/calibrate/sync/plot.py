@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -48,10 +47,8 @@ def draw(found: Synchronisation, path: Path | str) -> None:
     if signals:
         axes[-1][0].set_xlabel("session time [s]")
         axes[-1][1].set_xlabel("session time [s], where most moves")
-    png = io.BytesIO()
-    figure.savefig(png, dpi=80, format="png")
     with written_whole(Path(path)) as file:
-        file.write(png.getvalue())
+        figure.savefig(file, dpi=80, format="png")
 
 
 Signals = tuple[str, str, dict[str, tuple[np.ndarray, np.ndarray]]]
