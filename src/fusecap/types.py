@@ -2,6 +2,12 @@
 
     sources ──Detections, ImuReading──▶ associate ──Observation──▶ solve ──Estimate──▶ sinks
 
+Live, samples come one by one, each with a time of its own:
+
+    CameraImage ──detect──▶ CameraSample ┐
+                               ImuSample ├──▶ Event ──online──▶ Detections, ImuReading
+                           Command, Tick ┘
+
 Arrays are float64, shapes are types, missing values are NaN with confidence 0. Times are int
 nanoseconds on one clock.
 """
@@ -12,7 +18,7 @@ import enum
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 
 from fusecap.body.shape import BodyShape
 
@@ -34,6 +40,8 @@ class Detections:
     timestamp_ns: int
     people: tuple[Float[np.ndarray, "n k 3"], ...]
     """Per camera the n people's keypoints: x [px], y [px], confidence 0-1 (0 = missing)."""
+    looked: tuple[bool, ...] | None = None
+    """Per camera whether it sees at all, that is, whether nobody means nobody; None: all do."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -96,3 +104,76 @@ class TrackUpdate:
     """Per camera the index into `Detections.people`, or -1 where the track is not seen."""
     landmarks_in_world_m: Float[np.ndarray, "k 3"]
     """Triangulated from the assigned keypoints; NaN where fewer than two views agree."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraImage:
+    """One picture of a live camera."""
+
+    camera: int
+    """In the order of the rig."""
+    timestamp_ns: int
+    """Of the exposure, on the session's clock."""
+    image: UInt8[np.ndarray, "h w 3"]
+    """BGR."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraSample:
+    """Everyone the detector found in one picture of one camera."""
+
+    camera: int
+    """In the order of the rig."""
+    timestamp_ns: int
+    """Of the exposure, on the session's clock."""
+    people: Float[np.ndarray, "n k 3"]
+    """x [px], y [px], confidence 0-1; NaN, NaN, 0 where missing."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImuSample:
+    """What one sensor measured at one moment."""
+
+    subject: str
+    bone: str
+    """That carries the sensor; with the subject it says which sensor this is."""
+    timestamp_ns: int
+    """On the session's clock."""
+    orientation_wxyz: Float[np.ndarray, "4"]
+    """imu_world_from_imu, unit."""
+    accel_m_s2: Float[np.ndarray, "3"]
+    """Specific force in the imu frame (at rest +9.8 along up); NaN where not measured."""
+
+
+class CommandKind(enum.Enum):
+    """What a user may ask of a live run."""
+
+    REINITIALISE = "reinitialise"
+    """Find the subject (empty name: everyone) anew."""
+    ADD_SUBJECT = "add_subject"
+    """Make room for one more person."""
+    REMOVE_SUBJECT = "remove_subject"
+    """Follow this person no longer."""
+    TPOSE = "tpose"
+    """The subject (empty name: everyone with sensors) has stood in the T-pose for the last second;
+    its sensors' mounting is taken from there."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Command:
+    """A user's wish, in its place among the samples."""
+
+    kind: CommandKind
+    subject: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Tick:
+    """Solve this instant now, with the samples that have come so far."""
+
+    timestamp_ns: int
+    """On the session's clock."""
+
+
+Event = CameraSample | ImuSample | Command | Tick
+"""What a live run is made of; a recording holds events in the order in which they were taken."""

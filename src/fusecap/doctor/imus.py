@@ -25,7 +25,7 @@ def check_imus(session: Session, clocks: Clocks, findings: Findings) -> list[Imu
         for imu in subject.imus:
             where = f"imu '{imu.bone}' of '{subject.name}'"
             track = None
-            if imu.file.is_file():
+            if imu.file is not None and imu.file.is_file():
                 try:
                     track = read_imu(
                         imu.file, format=imu.format, sensor=imu.sensor, rate_hz=imu.rate_hz

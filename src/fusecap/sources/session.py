@@ -214,14 +214,17 @@ class CameraSettings(_Table):
     rate_hz: Positive | None = None
     """None: the session's."""
     offset_s: Number = 0.0
-    """Added to the camera's times (frame number / rate)."""
+    """Added to the camera's times (frame number / rate; live: the device's stamps)."""
+    live: Name | None = None
+    """Where `fusecap live` gets its pictures or keypoints (`fusecap.sources.live_address`)."""
 
     @model_validator(mode="after")
     def _has_a_source(self) -> CameraSettings:
-        if self.keypoints is None and self.video is None:
+        if self.keypoints is None and self.video is None and self.live is None:
             raise PydanticCustomError(
                 "no_source",
-                "neither keypoints nor video is given; name a folder of keypoint files or a video",
+                "neither keypoints, video nor live is given; name a folder of keypoint files, a "
+                "video, or where a live camera is found",
             )
         return self
 
@@ -235,7 +238,9 @@ class ImuSettings(_Table):
     """`[[subject.imu]]`."""
 
     bone: Name
-    file: File
+    file: File | None = None
+    live: Name | None = None
+    """Where `fusecap live` gets its samples (`fusecap.sources.live_address`)."""
     format: Annotated[str, _one_of(IMU_FORMATS)] = "csv"
     sensor: Name | None = None
     """Which sensor of a file that holds several."""
@@ -250,6 +255,21 @@ class ImuSettings(_Table):
     """Rotation about world up that turns the sensor's reference world into ours."""
     imu_up: Annotated[str, _one_of(["y", "z"])] = "z"
     """The up axis of the sensor's reference world."""
+
+    @model_validator(mode="after")
+    def _has_a_source(self) -> ImuSettings:
+        if self.file is None and self.live is None:
+            raise PydanticCustomError(
+                "no_source",
+                "neither file nor live is given; name a file of samples, or where a live sensor "
+                "is found",
+            )
+        return self
+
+    @property
+    def source_name(self) -> str:
+        """Of its file, else where it is found live."""
+        return self.file.name if self.file is not None else self.live or ""
 
 
 class SubjectSettings(_Table):
@@ -287,6 +307,19 @@ class EstimatorSettings(_Table):
     floor_radius_m: NotNegative | None = None
 
 
+class LiveSettings(_Table):
+    """`[live]`: of `fusecap live`."""
+
+    delay_s: NotNegative | None = None
+    """Between exposure and solve; None: 0.2 with a detector in the loop, 0.05 without."""
+    eager: Flag | None = None
+    """Solve as soon as every source has what an instant needs, at the latest after the delay;
+    None: where keypoints come from outside."""
+    hold_s: NotNegative = 10.0
+    """How long a person whom nothing measures is still sent, in the last pose and with fading
+    quality."""
+
+
 class Session(_Table):
     """A whole session file; relative paths in it have become paths from the caller's folder."""
 
@@ -295,6 +328,7 @@ class Session(_Table):
     subjects: tuple[SubjectSettings, ...] = Field(default=(), alias="subject")
     estimator: EstimatorSettings = EstimatorSettings()
     detector: DetectorSettings = DetectorSettings()
+    live: LiveSettings = LiveSettings()
     _path: Path = PrivateAttr(default=Path(FILE_NAME))
 
     def model_post_init(self, context: Any) -> None:

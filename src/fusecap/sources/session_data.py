@@ -307,10 +307,14 @@ def open_imus(subject: SubjectSettings) -> list[ImuTrack]:
 
     Sensors that share a recorder's clock keep their mutual delays: the earliest starts at 0.
     """
-    tracks = [
-        read_imu(imu.file, format=imu.format, sensor=imu.sensor, rate_hz=imu.rate_hz)
-        for imu in subject.imus
-    ]
+    tracks = []
+    for imu in subject.imus:
+        if imu.file is None:
+            raise SessionError(
+                f"imu '{imu.bone}' of '{subject.name}' is live only; name a file of its samples, "
+                "or use: fusecap live"
+            )
+        tracks.append(read_imu(imu.file, format=imu.format, sensor=imu.sensor, rate_hz=imu.rate_hz))
     delays = _shared_delays_s(tracks)
     return [
         replace(track, times_s=track.times_s + delay + imu.offset_s)

@@ -168,7 +168,7 @@ def calibrate_subject(
                 Skipped(
                     subject=reference.subject,
                     bone=each.settings.bone,
-                    file=each.settings.file.name,
+                    file=each.settings.source_name,
                     reason=reason,
                 )
             )
@@ -458,7 +458,7 @@ def _sensor(
     sensor = SensorCalibration(
         subject=reference.subject,
         bone=worn.settings.bone,
-        file=worn.settings.file.name,
+        file=worn.settings.source_name,
         bone_from_imu_wxyz=(float(xyzw[3]), float(xyzw[0]), float(xyzw[1]), float(xyzw[2])),
         heading_deg=float(np.degrees(fitted.heading_rad)),
         drift_deg_min=float(np.degrees(drifting.drift_rad_s) * 60),
@@ -522,7 +522,7 @@ def _verdict(
     bone = worn.settings.bone
     if identity is not None and identity.contradicts:
         return "wrong bone", (
-            f"'{worn.settings.file.name}' is stated on {bone} but moves like {identity.found}; "
+            f"'{worn.settings.source_name}' is stated on {bone} but moves like {identity.found}; "
             "change the bone of this [[subject.imu]] and calibrate again"
         )
     if change is not None:

@@ -1,0 +1,1 @@
+"""Pages in a browser: a live run, a take, a recording."""
