@@ -29,7 +29,7 @@ def complaint(tmp_path, text):
         ("offset_s = inf\n", ["offset_s", "finite"]),
         ('format = "openpose-body52"\n', ["format", "did you mean 'openpose-body25'"]),
         ('[[camera]]\nname = "left"\nkeypoints = "k"\n', ["two [[camera]]", "'left'"]),
-        ('[[camera]]\nname = "b"\n', ["'b'", "neither keypoints nor video"]),
+        ('[[camera]]\nname = "b"\n', ["'b'", "neither keypoints, video nor live"]),
         ('[[camera]]\nname = ""\nvideo="v.mp4"\n', ["name", "empty"]),
         ('[[subject]]\nname = "A"\n[[subject]]\nname = "A"\n', ["two [[subject]]", "'A'"]),
         ('[[subject]]\nname = "A"\nheight_m = 178\n', ["height_m is 178", "metres", "1.78"]),
