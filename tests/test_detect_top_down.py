@@ -78,16 +78,32 @@ def run(detector: TopDownDetector, world: World, predicted=None) -> tuple[np.nda
     return detector.detect(world.images(), predicted or [NOBODY] * len(world.people))
 
 
-def test_person_detector_runs_every_so_many_instants():
+def test_views_are_searched_every_so_many_instants_in_turn():
     world = World(2)
     detector = TopDownDetector(world, world, person_every=5)
-    for instant in range(11):
+    searched = []
+    for instant in range(12):
         world.people = [[person(300.0 + 5 * instant)], [person(600.0), person(200.0)]]
         found = run(detector, world)
         assert [len(people) for people in found] == [1, 2]
         np.testing.assert_array_equal(found[0][0], world.people[0][0])
-    assert world.searched == [0, 1] * 3
-    assert world.crops == [3] * 11
+        searched.append(world.searched.copy())
+        world.searched.clear()
+    assert searched == [[0, 1], [], [], [1], [], [0], [], [], [1], [], [0], []]
+    assert world.crops == [3] * 12
+
+
+def test_view_without_an_image_at_its_turn_is_searched_at_its_next_image():
+    world = World(2)
+    world.people = [[person(300.0)], [person(600.0)]]
+    detector = TopDownDetector(world, world, person_every=4)
+    searched = []
+    for shown in ([0], [0], [0], [0, 1], [0, 1], [0], [0], [0, 1]):
+        images = [image if view in shown else None for view, image in enumerate(world.images())]
+        detector.detect(images, [NOBODY] * 2)
+        searched.append(world.searched.copy())
+        world.searched.clear()
+    assert searched == [[0], [], [], [1], [0], [], [], [1]]
 
 
 def test_everyone_goes_through_in_one_batch_and_a_missing_image_is_nobody():

@@ -11,10 +11,10 @@ the GIL.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -22,10 +22,14 @@ from jaxtyping import Float
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.body.prior import PosePrior
 from fusecap.body.skeleton import Skeleton
+from fusecap.errors import SessionError
 from fusecap.geometry.camera import Rig
 from fusecap.solve.estimator import Estimator, SubjectModel
 from fusecap.solve.options import SolverOptions
 from fusecap.types import Detections, Estimate, ImuReading, Observation, TrackState, TrackUpdate
+
+BLIND_START_S = 2.0
+"""For so long sensors wait for a camera that says where their subject is."""
 
 
 class Sorter(Protocol):
@@ -38,6 +42,23 @@ class Sorter(Protocol):
         now_ns: int,
     ) -> list[TrackUpdate]:
         """What each track was given; `predicted` are landmarks [m] by track id."""
+        ...
+
+
+@runtime_checkable
+class Cast(Protocol):
+    """A sorter whose subjects may change in the middle."""
+
+    def reinitialise(self, name: str = "") -> None:
+        """Find a subject, or without a name everybody, anew."""
+        ...
+
+    def add_subject(self, name: str = "") -> None:
+        """Make room for one more person; raises `SessionError` where that cannot be."""
+        ...
+
+    def remove_subject(self, name: str) -> None:
+        """Follow a subject no longer."""
         ...
 
 
@@ -90,6 +111,9 @@ class Pipeline:
         self._models = {model.name: model for model in subjects}
         self._pool = pool
         self._estimators: dict[str, Estimator] = {}
+        self._removed: set[str] = set()
+        self._looked_ns: int | None = None
+        """When a camera last looked, at the latest at the first instant."""
 
     def step(self, detections: Detections, readings: Mapping[str, ImuReading]) -> Step:
         """One instant: `readings` holds, by subject name, what its sensors say."""
@@ -132,6 +156,42 @@ class Pipeline:
         """What is known about a subject; nothing about one the session does not name."""
         return self._models.get(name) or SubjectModel(name=name)
 
+    def predicted(self, names: Iterable[str], now_ns: int) -> list[Float[np.ndarray, "k 3"]]:
+        """Landmarks [m] expected at `now_ns` of those of these subjects that have a pose."""
+        points = [self._estimators[n].predict(now_ns) for n in names if n in self._estimators]
+        return [some for some in points if some is not None]
+
+    def reinitialise(self, name: str = "") -> None:
+        """Find a subject, or without a name everybody, anew: place, pose and unmeasured body.
+
+        Raises `SessionError`, as the other two do, where the sorter's subjects cannot change.
+        """
+        if self._sorter is not None:
+            self._cast(self._sorter).reinitialise(name)
+        for gone in [name] if name else list(self._estimators):
+            self._estimators.pop(gone, None)
+
+    def add_subject(self, name: str = "") -> None:
+        """Make room for one more person; without cameras only for one who was removed."""
+        if self._sorter is not None:
+            self._cast(self._sorter).add_subject(name)
+        elif name not in self._removed:
+            raise SessionError("without cameras nobody new is found; name someone who was removed")
+        self._removed.discard(name)
+
+    def remove_subject(self, name: str) -> None:
+        """Follow a subject no longer, not by its sensors either."""
+        if self._sorter is not None:
+            self._cast(self._sorter).remove_subject(name)
+        self._estimators.pop(name, None)
+        self._removed.add(name)
+
+    @staticmethod
+    def _cast(sorter: Sorter) -> Cast:
+        if isinstance(sorter, Cast):
+            return sorter
+        raise SessionError('associate = "paper" follows those it began with; use "tracker"')
+
     def _sort(
         self, detections: Detections, readings: Mapping[str, ImuReading]
     ) -> list[TrackUpdate]:
@@ -144,10 +204,14 @@ class Pipeline:
                     predicted[estimator.track_id] = points
             updates = self._sorter.update(detections, predicted, detections.timestamp_ns)
         sorted_names = {update.name for update in updates}
+        if self._looked_ns is None or detections.looked is None or any(detections.looked):
+            self._looked_ns = detections.timestamp_ns
+        blind_s = (detections.timestamp_ns - self._looked_ns) * 1e-9
         for index, name in enumerate(self._models):
-            # Sensors go on where no camera sees their subject.
-            started = self._sorter is None or name in self._estimators
-            if name not in sorted_names and started and name in readings:
+            # Sensors go on where no camera sees their subject, and begin where no camera looks.
+            started = self._sorter is None or name in self._estimators or blind_s > BLIND_START_S
+            wanted = name not in sorted_names and name not in self._removed
+            if wanted and started and name in readings:
                 updates.append(self._unseen(index, name))
         return updates
 

@@ -109,6 +109,18 @@ def scene_before(
     )
 
 
+def sites_of(session: Session) -> dict[str, ImuSites]:
+    """Where the sensors of everyone who wears some sit, by subject."""
+    return {
+        subject.name: ImuSites(
+            bone=tuple(session.skeleton.bone(imu.bone) for imu in subject.imus),
+            position_m=np.array([imu.position_m for imu in subject.imus], dtype=np.float64),
+        )
+        for subject in session.subjects
+        if subject.imus
+    }
+
+
 def make_sorter(
     rig: Rig,
     landmarks: LandmarkSet,

@@ -20,11 +20,14 @@ class Track:
     """Landmarks with constant velocity, what was seen of them, and the body's measure."""
 
     __slots__ = (
+        "alone_ns",
         "born_ns",
+        "dismissed",
         "frames",
         "landmarks",
         "limb_count",
         "limb_sum_m",
+        "missed_ns",
         "overlap_since_ns",
         "seen_ns",
         "strong_frames",
@@ -50,6 +53,12 @@ class Track:
         self.limb_sum_m = np.nan_to_num(limb_lengths_m)
         self.overlap_since_ns: int | None = None
         """Since when it has shared its place with another track."""
+        self.missed_ns = 0
+        """For how long enough cameras have looked and not seen it."""
+        self.alone_ns = 0
+        """For how long two cameras or more have looked and no two seen it."""
+        self.dismissed = False
+        """Whether it was said not to be a subject."""
 
     def predict(self, now_ns: int, solved: np.ndarray | None) -> np.ndarray:
         """Landmarks [m] now: the solver's where it gives them, else extrapolated."""
@@ -62,6 +71,27 @@ class Track:
         self.landmarks = measured
         self.velocity = np.zeros(measured.shape)
         self.time_ns = self.seen_ns = self.triangulated_ns = now_ns
+
+    def settle(self, landmarks: np.ndarray, now_ns: int) -> None:
+        """Stand still where one view found the person again."""
+        self.landmarks = landmarks
+        self.velocity = np.zeros(landmarks.shape)
+        self.time_ns = self.seen_ns = now_ns
+
+    def wait(self, now_ns: int, elapsed_ns: int, looking: int, enough: int) -> None:
+        """Count the time since the last instant, while `looking` cameras looked, as unseen.
+
+        What fewer than `enough` cameras could see is no absence, and one camera that is left
+        cannot triangulate.
+        """
+        if self.seen_ns == now_ns:
+            self.missed_ns = 0
+        elif looking >= enough:
+            self.missed_ns += elapsed_ns
+        if self.triangulated_ns == now_ns:
+            self.alone_ns = 0
+        elif looking > 1:
+            self.alone_ns += elapsed_ns
 
     def limb_lengths_m(self) -> np.ndarray:
         """Mean limb lengths [m] (m,); NaN where never seen."""

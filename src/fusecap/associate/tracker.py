@@ -153,6 +153,8 @@ class Tracker:
                 )
             self._max_subjects = 1
         self._limits_px = np.array([camera.size_px for camera in rig.cameras]).reshape(-1, 2)
+        self._looking = np.ones(len(rig), dtype=bool)
+        self._last_ns: int | None = None
 
     def update(
         self,
@@ -167,6 +169,7 @@ class Tracker:
         then newcomers under trial, without a name.
         """
         views = Views.of(self._rig, detections)
+        self._looking = np.array(detections.looked or (True,) * len(self._rig))
         tracks = self._tracks
         expected = np.empty((len(tracks), *views.rays.shape[1:]))
         for t, track in enumerate(tracks):
@@ -176,12 +179,53 @@ class Tracker:
         self._absorb(person, measured, expected, now_ns)
         if not self._single and free.any():
             person, measured = self._find(views, person, measured, free, now_ns)
+            if self._looking.sum() == 1:
+                self._find_alone(views, person, expected, free, now_ns)
         self._follow(views, person, expected, now_ns)
         if self._single:
             person, measured = self._find_single(views, person, measured, expected, now_ns)
         self._forget(measured, now_ns)
         self._admit(now_ns)
+        self._last_ns = now_ns
         return self._report(views.local(person), measured, tracks, now_ns)
+
+    # ---------------------------------------------------------------------------------------- cast
+
+    def reinitialise(self, name: str = "") -> None:
+        """Forget a subject's track, body and start position, so that it is found anew anywhere.
+
+        Without a name everybody is found as at the beginning.
+        """
+        places = [place for place in self._places if name in ("", place.name)]
+        gone = [place.track for place in places]
+        self._tracks = [track for track in self._tracks if name and track not in gone]
+        for place in places:
+            place.track, place.live = None, False
+            if name:
+                place.start_m = None
+
+    def add_subject(self, name: str = "") -> None:
+        """Make room for one more person, with a name or `personN`; who was removed may come too.
+
+        Raises `SessionError` for a second person before a single camera.
+        """
+        if self._single and self._max_subjects > 0:
+            raise SessionError("one camera cannot tell two people apart; add a camera")
+        if name and all(place.name != name for place in self._places):
+            self._places.append(_Place(name=name, named=True, start_m=None))
+        if self._max_subjects < sys.maxsize:
+            self._max_subjects += 1
+        for track in self._tracks:
+            track.dismissed = False
+
+    def remove_subject(self, name: str) -> None:
+        """Follow a subject no longer; there is one place less."""
+        for place in [place for place in self._places if place.name == name]:
+            self._places.remove(place)
+            if place.live and place.track is not None:
+                place.track.dismissed = True
+            if self._max_subjects < sys.maxsize:
+                self._max_subjects -= 1
 
     # ------------------------------------------------------------------ match, check, second round
 
@@ -283,10 +327,11 @@ class Tracker:
         return (in_cam - cam.translation) @ cam.rotation
 
     def _cameras_that_see(self, landmarks: np.ndarray) -> int:
-        """Cameras that image most of a skeleton."""
+        """Cameras that look, and image most of a skeleton."""
         known = landmarks[np.isfinite(landmarks[:, 0])]
         seeing = 0
-        for camera, limit in zip(self._rig.cameras, self._limits_px, strict=True):
+        for c in np.flatnonzero(self._looking):
+            camera, limit = self._rig.cameras[c], self._limits_px[c]
             pixels = camera.project(known)
             inside = ((pixels >= 0) & (pixels < limit)).all(axis=1)
             seeing += int(inside.mean() > 0.5)
@@ -331,6 +376,38 @@ class Tracker:
             person = np.concatenate([person, candidate.person[None]])
             measured = np.concatenate([measured, landmarks[None]])
         return person, measured
+
+    def _find_alone(
+        self,
+        views: Views,
+        person: np.ndarray,
+        expected: np.ndarray,
+        free: np.ndarray,
+        now_ns: int,
+    ) -> None:
+        """The one camera that is left sees an unseen subject again, near where it is expected.
+
+        At the depth it had, and nearer than it can have gone; who is who then is a guess.
+        """
+        o = self._options
+        subjects = self._subjects()
+        unseen = [
+            t
+            for t, track in enumerate(self._tracks)
+            if track.track_id in subjects and (person[t] < 0).all()
+        ]
+        if not unseen:
+            return
+        away_s = [(now_ns - self._tracks[t].seen_ns) * 1e-9 for t in unseen]
+        reach = o.reach_m + o.reach_speed_m_s * np.array(away_s)
+        distance = views.distances(expected[unseen], 2 * float(reach.max()), free)
+        for row, n in _cheapest(np.where(distance < reach[:, None], distance, np.inf)):
+            track, camera = self._tracks[unseen[row]], int(views.camera_of[n])
+            seen = self._at_depth(camera, views.rays[n], expected[unseen[row]])
+            moved = np.nanmedian(seen - expected[unseen[row]], axis=0)
+            track.settle(np.where(np.isnan(seen), track.landmarks + moved, seen), now_ns)
+            person[unseen[row], camera] = n
+            free[n] = False
 
     def _begin(self, landmarks: np.ndarray, now_ns: int) -> Track:
         track = Track(self._next_id, landmarks, self._anatomy.limb_lengths(landmarks), now_ns)
@@ -413,12 +490,20 @@ class Tracker:
         """Let go of tracks unseen for too long, and of the younger of two on one person."""
         o = self._options
         subjects = self._subjects()
+        elapsed_ns = 0 if self._last_ns is None else now_ns - self._last_ns
+        looking = int(self._looking.sum())
         alive = []
         for track in self._tracks:
             known = track.track_id in subjects or self._established(track)
-            unseen_s = (now_ns - track.seen_ns) * 1e-9
-            alone_s = 0.0 if self._single else (now_ns - track.triangulated_ns) * 1e-9
-            if unseen_s <= (o.coast_s if known else o.tentative_s) and alone_s <= o.single_view_s:
+            enough = min(2, len(self._rig)) if known else 1
+            track.wait(now_ns, elapsed_ns, looking, enough)
+            missed_s, alone_s = track.missed_ns * 1e-9, track.alone_ns * 1e-9
+            away_s = (now_ns - track.seen_ns) * 1e-9
+            if (
+                missed_s <= (o.coast_s if known else o.tentative_s)
+                and alone_s <= o.single_view_s
+                and away_s <= o.coast_s + o.memory_s
+            ):
                 alive.append(track)
         doubled = self._doubled(alive, measured, now_ns)
         self._tracks = [track for track in alive if track not in doubled]
@@ -461,6 +546,7 @@ class Tracker:
             track
             for track in self._tracks
             if track.track_id not in subjects
+            and not track.dismissed
             and track.seen_ns == now_ns
             and self._established(track)
             and self._inside(track)
@@ -475,7 +561,7 @@ class Tracker:
         rest = [t for n, t in enumerate(newcomers) if n not in dict(admitted)]
         rest.sort(key=lambda t: (-t.frames, self._from_middle(t)))
         waiting = [p for p in self._places if not (p.live or p.track or p.start_m)]
-        chosen = rest[: len(waiting) + self._room()]
+        chosen = rest[: len(waiting) + max(self._room(), 0)]
         for track in sorted(chosen, key=lambda t: t.track_id):
             if not waiting:
                 waiting.append(_Place(name=self._free_name(), named=False, start_m=None))

@@ -31,9 +31,11 @@ from fusecap.cli import (
     evaluate_twin,
     export,
     init,
+    live,
     simulate,
     solve,
     stream,
+    view,
 )
 from fusecap.cli.common import err, print_json
 from fusecap.errors import FusecapError
@@ -76,8 +78,10 @@ app.command(epilog=solve.EXAMPLE)(solve.solve)
 app.command(epilog=export.EXAMPLE)(export.export)
 app.command(epilog=doctor.EXAMPLE)(doctor.doctor)
 app.command(epilog=init.EXAMPLE)(init.init)
+app.command(epilog=live.EXAMPLE)(live.live)
 app.command(epilog=simulate.EXAMPLE)(simulate.simulate)
 app.command(epilog=stream.EXAMPLE)(stream.stream)
+app.command(epilog=view.EXAMPLE)(view.view)
 calibrate.command(epilog=calibrate_board.EXAMPLE)(calibrate_board.board)
 calibrate.command(epilog=calibrate_intrinsics.EXAMPLE)(calibrate_intrinsics.intrinsics)
 calibrate.command(epilog=calibrate_extrinsics.EXAMPLE)(calibrate_extrinsics.extrinsics)

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from fusecap.offline.solve import Solved
     from fusecap.sinks.take import Take
 
-err = Console(stderr=True, highlight=False)
-console = Console(highlight=False)
+err = Console(stderr=True, highlight=False, emoji=False)
+console = Console(highlight=False, emoji=False)
 EXPORTS = ("bvh",)
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object for machines.")]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -17,6 +17,10 @@ from fusecap.cli.common import (
     progress,
     write_take,
 )
+
+if TYPE_CHECKING:
+    from fusecap.evaluate.simulator import Simulation
+    from fusecap.sinks.take import Take
 
 EXAMPLE = "Example: fusecap demo --out demo --json"
 
@@ -33,6 +37,9 @@ def demo(
     write_session: Annotated[
         Path | None, typer.Option(help="Also write the scene as a session folder.")
     ] = None,
+    view: Annotated[
+        bool, typer.Option("--view", help="Then look at it in a browser, until Ctrl-C.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Solve a simulated scene with known truth: 2 subjects, 1 bystander, 4 cameras, 13 IMUs each.
@@ -46,6 +53,10 @@ def demo(
     from fusecap.evaluate.score import score_take
     from fusecap.evaluate.simulated_solve import solve_simulation
 
+    if view and as_json:
+        raise typer.BadParameter(
+            "it serves a page until Ctrl-C; leave --json out", param_hint="--view"
+        )
     check_choice("--associate", associate, ("tracker", "paper"))
     simulation = demo_scene(seed, seconds=seconds)
     if write_session:
@@ -80,6 +91,15 @@ def demo(
         )
         print_speed(solved)
     finish(solved, files, as_json)
+    if view:
+        _show(solved.take, simulation)
+
+
+def _show(take: Take, simulation: Simulation) -> None:
+    from fusecap.cli.view import error_curves, look
+
+    curves = error_curves(take, simulation.truth)
+    look(take, "fusecap demo", rig=simulation.rig, curves=curves)
 
 
 def _spread(summary: Any) -> str:

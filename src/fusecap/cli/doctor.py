@@ -2,24 +2,37 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Annotated
+
 import typer
 
-from fusecap.cli.common import Json, SessionPath, console, print_json, progress
+from fusecap.cli.common import Json, console, print_json, progress
 
 EXAMPLE = "Example: fusecap doctor recordings/duo"
 
 
 def doctor(
-    session: SessionPath,
+    session: Annotated[
+        Path,
+        typer.Argument(
+            help="session.toml, the folder that holds it, or the recording (.mcap) of a live run.",
+            show_default=False,
+        ),
+    ],
     as_json: Json = False,
 ) -> None:
-    """Check a session before it is solved: what is wrong, and what to do about it."""
+    """Check a session before it is solved: what is wrong, and what to do about it.
+
+    Of a recording: what is in it, how steadily its sources came, and whether it is whole.
+    """
     from dataclasses import asdict
 
-    from fusecap.doctor import diagnose
+    from fusecap.doctor import diagnose, diagnose_recording
 
     with progress(quiet=as_json) as show:
-        findings = diagnose(session, show)
+        check = diagnose_recording if session.suffix == ".mcap" else diagnose
+        findings = check(session, show)
     errors = sum(finding.severity == "error" for finding in findings)
     if as_json:
         print_json({"findings": [asdict(f) for f in findings], "errors": errors})

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from fusecap.cli.common import (
     EXPORTS,
     Json,
-    SessionPath,
     Unit,
     check_choice,
     console,
@@ -26,24 +25,45 @@ from fusecap.errors import InputError
 if TYPE_CHECKING:
     from fusecap.offline.solve import Solved, SolveReport
 
-EXAMPLE = "Example: fusecap solve recordings/duo --export bvh --json > report.json"
+EXAMPLE = (
+    "Examples: fusecap solve recordings/duo --export bvh --json > report.json  |  "
+    "fusecap solve recordings/duo/duo-2026-03-01-101500.mcap"
+)
 
 
 def solve(
-    session: SessionPath,
+    session: Annotated[
+        Path,
+        typer.Argument(
+            help="session.toml, the folder that holds it, or the recording (.mcap) of a live run.",
+            show_default=False,
+        ),
+    ],
     out: Annotated[
-        Path | None, typer.Option(help="The take to write; default SESSION/<name>.npz.")
+        Path | None,
+        typer.Option(
+            help="The take to write; default SESSION/<name>.npz, of a recording beside it."
+        ),
     ] = None,
     export: Annotated[
         str | None, typer.Option(help="Other formats beside the take, e.g. bvh.")
     ] = None,
     unit: Unit = "m",
     picture: Annotated[bool, typer.Option("--picture", help="Also draw the motion.")] = False,
+    as_live: Annotated[
+        bool,
+        typer.Option(
+            "--as-live",
+            help="Of a recording: the poses of the run again, instead of a better second solve.",
+        ),
+    ] = False,
     as_json: Json = False,
 ) -> None:
-    """Solve a recorded session: videos or keypoints, and IMU files, to each person's motion.
+    """Solve a recorded session, or the recording of a live run, to each person's motion.
 
     Keypoints of videos are detected first (as `fusecap detect` does) and kept for the next time.
+    A recording is solved from all that was recorded, in two passes; with --as-live its events are
+    gone through as in the run, and the poses are compared with those recorded.
     """
     from fusecap.cli.detect import detect_missing, print_detection
     from fusecap.offline.solve import solve_session
@@ -53,10 +73,15 @@ def solve(
 
     formats = _formats(export)
     check_choice("--unit", unit, ("m", "cm"))
+    if session.suffix == ".mcap":
+        _solve_recording(
+            session, out, formats, unit, picture=picture, as_live=as_live, quiet=as_json
+        )
+        return
+    if as_live:
+        raise InputError(f"--as-live: {session} is no recording (.mcap) of a live run")
     loaded = load_session(session)
-    target = out or loaded.folder / f"{safe_name(loaded.settings.name)}.npz"
-    if target.suffix != ".npz":
-        raise InputError(f"--out {target}: a take is one .npz file")
+    target = _take_path(out, loaded.folder / f"{safe_name(loaded.settings.name)}.npz")
     detected = detect_missing(loaded, quiet=as_json)
     if detected is not None and not as_json:
         print_detection(detected)
@@ -68,10 +93,52 @@ def solve(
     if not solved.take.tracked.any() and not solved.report.interrupted:
         raise InputError(_nobody(solved.report))
     files = write_take(solved.take, target, exports=formats, unit=unit, picture=picture)
+    detection = {} if detected is None else {"detection": detected.as_json()}
+    _print_solved(solved, files, detection, as_json)
+
+
+def _solve_recording(
+    path: Path,
+    out: Path | None,
+    formats: list[str],
+    unit: str,
+    *,
+    picture: bool,
+    as_live: bool,
+    quiet: bool,
+) -> None:
+    from fusecap.offline.replay import solve_as_live
+    from fusecap.offline.second_solve import solve_recording
+    from fusecap.sources.recording import Recording
+
+    ending = "-as-live.npz" if as_live else ".npz"
+    target = _take_path(out, path.with_name(path.stem + ending))
+    recording = Recording(path)
+    replay: dict[str, dict[str, int]] = {}
+    with progress(quiet=quiet) as show:
+        if as_live:
+            solved, again = solve_as_live(recording, progress=show)
+            replay = {"replay": {"poses": again.poses, "equal": again.equal}}
+        else:
+            solved = solve_recording(recording, progress=show)
+    if not solved.take.tracked.any() and not solved.report.interrupted:
+        raise InputError(
+            f"nobody could be followed in {solved.report.instants} instants of {path}; nothing "
+            f"was written. What is in it: fusecap doctor {path}"
+        )
+    files = write_take(solved.take, target, exports=formats, unit=unit, picture=picture)
+    _print_solved(solved, files, replay, quiet)
+
+
+def _take_path(out: Path | None, usual: Path) -> Path:
+    if out is not None and out.suffix != ".npz":
+        raise InputError(f"--out {out}: a take is one .npz file")
+    return out or usual
+
+
+def _print_solved(solved: Solved, files: list[Path], more: dict[str, Any], as_json: bool) -> None:
     if as_json:
-        detection = {} if detected is None else {"detection": detected.as_json()}
-        paths = [str(path) for path in files]
-        print_json(solved.report.as_json() | detection | {"files": paths})
+        print_json(solved.report.as_json() | more | {"files": [str(path) for path in files]})
     else:
         for note in solved.report.notes:
             err.print(f"[yellow]note[/] {note}", soft_wrap=True)

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from fusecap.cli.common import Json, console, err, print_json
+from fusecap.cli.targets import TO_HELP, placed_targets, warn_if_open
 
 if TYPE_CHECKING:
     from fusecap.live.playback import PlaybackState, TakePlayer
     from fusecap.live.streams import Stream
-    from fusecap.live.target import Target
 
 EXAMPLE = "Example: fusecap stream demo/demo.npz --to vmc://127.0.0.1:39539 --to ws --loop"
 
@@ -27,11 +27,7 @@ def stream(
     take: Annotated[Path, typer.Argument(help="A solved take (.npz).", show_default=False)],
     to: Annotated[
         list[str],
-        typer.Option(
-            help="Where to: vmc, livelink, rokoko, osc, each with ://HOST:PORT unless the usual "
-            "port of this machine will do; ws (serves WebSocket clients); lsl. Repeatable.",
-            show_default=False,
-        ),
+        typer.Option(help=TO_HELP, show_default=False),
     ],
     loop: Annotated[
         bool, typer.Option("--loop", help="Start again at the end, until Ctrl-C.")
@@ -56,10 +52,9 @@ def stream(
     """
     from fusecap.live.playback import TakePlayer, play
     from fusecap.live.streams import open_stream
-    from fusecap.live.target import parse_target
     from fusecap.sinks.take import load_take
 
-    targets = _targets([parse_target(text) for text in to], host)
+    targets = placed_targets(to, host)
     loaded = load_take(take)
     player = TakePlayer(loaded, subjects=subject or (), speed=speed, loop=loop)
     with ExitStack() as closing:
@@ -71,7 +66,7 @@ def stream(
         if not as_json:
             _announce(player, streams, simulated=simulated)
         for target in targets:
-            _warn_if_open(target)
+            warn_if_open(target)
         with _status(streams, quiet=as_json) as each_second:
             state = play(player, streams, each_second=each_second)
         remarks = [stream.remark() for stream in streams]
@@ -82,42 +77,6 @@ def stream(
         _print_end(state, streams, remarks, notes)
     if state.interrupted and not loop:
         raise typer.Exit(130)
-
-
-def _targets(targets: list[Target], host: str | None) -> list[Target]:
-    """Targets with `--host` in place; serving other machines takes that option."""
-    from fusecap.errors import InputError
-    from fusecap.live.target import is_loopback
-
-    if host is not None and all(target.protocol != "ws" for target in targets):
-        raise InputError("--host is the address on which ws serves clients; add --to ws")
-    placed = [
-        replace(target, host=host) if target.protocol == "ws" and host is not None else target
-        for target in targets
-    ]
-    for target in placed:
-        if target.protocol == "ws" and host is None and not is_loopback(target.host):
-            raise InputError(
-                f"--to {target}: this would let other machines connect; "
-                f"if that is meant, add --host {target.host}"
-            )
-    seen: set[str] = set()
-    for target in placed:
-        if str(target) in seen:
-            raise InputError(f"--to {target} is given twice")
-        seen.add(str(target))
-    return placed
-
-
-def _warn_if_open(target: Target) -> None:
-    from fusecap.live.target import is_loopback
-
-    if target.protocol == "ws" and not is_loopback(target.host):
-        err.print(
-            f"[yellow]note[/] {target} is open: whoever reaches this machine on port "
-            f"{target.port} can follow the motion; there is no password and no encryption",
-            soft_wrap=True,
-        )
 
 
 def _announce(player: TakePlayer, streams: Sequence[Stream], *, simulated: bool) -> None:

@@ -14,7 +14,7 @@ from fusecap.body.landmarks import LandmarkSet
 DEFAULT_MODEL = "rtmpose-m-halpe26"
 DEFAULT_PERSON_MODEL = "rtmdet-nano-person"
 
-REVISION = 2
+REVISION = 3
 """Of the way from images to keypoints. Raise it with every change that gives other keypoints for
 the same video: colours of decoded pictures, crops, decoding of outputs, thresholds, who is kept,
 when the person detector runs, where people are expected (`fusecap.offline`). Keypoints of another

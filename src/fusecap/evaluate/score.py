@@ -80,7 +80,7 @@ def score_take(take: Take, truth: Take, *, gate_m: float = 0.5) -> TakeScore:
     """Score the frames that both takes have; people are matched frame by frame, by distance."""
     if take.bone_names != truth.bone_names:
         raise TakeError("the take and its truth have different skeletons")
-    rows, true_rows = _same_instants(take.timestamps_ns, truth.timestamps_ns)
+    rows, true_rows = same_instants(take.timestamps_ns, truth.timestamps_ns)
     if len(rows) == 0:
         raise TakeError("the take and its truth share no timestamp")
     position = take.bone_position_in_world_m[:, rows]
@@ -163,7 +163,7 @@ def _motion(
     }
 
 
-def _same_instants(
+def same_instants(
     times_ns: Int[np.ndarray, " n"], true_times_ns: Int[np.ndarray, " m"]
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
     """Rows of both at the same time, but for the rounding of files."""

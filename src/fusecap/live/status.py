@@ -99,5 +99,5 @@ class LiveStatus:
     incidents: tuple[Incident, ...]
     """The latest, oldest first."""
     cpu_share: float
-    """Of one core; 1.5 is one and a half cores."""
+    """Of one core; 1.5 is one and a half cores. Like memory without the process of the streams."""
     memory_mb: float

@@ -6,9 +6,10 @@ from collections.abc import Callable
 from typing import Protocol
 
 from fusecap.body.shape import BodyShape
+from fusecap.body.skeleton import Skeleton
 from fusecap.errors import InputError
 from fusecap.live.target import Target
-from fusecap.live.transports import Counts, LslOutlet, UdpSender, WebSocketServer
+from fusecap.live.transports import Counts, LslOutlet, UdpSender, WebSocketServer, check_lsl
 from fusecap.sinks.streams.livelink import livelink_datagrams
 from fusecap.sinks.streams.lsl import lsl_sample
 from fusecap.sinks.streams.osc import osc_datagrams
@@ -29,6 +30,10 @@ class Stream(Protocol):
 
     def send(self, frame: StreamFrame) -> None:
         """Send one instant; never waits."""
+        ...
+
+    def set_cast(self, cast: Cast) -> None:
+        """From now on it is about these people; raises `InputError` where some have no room."""
         ...
 
     def remark(self) -> str:
@@ -71,6 +76,9 @@ class UdpStream:
         for datagram in self._encode(frame):
             self._sender.send(datagram)
 
+    def set_cast(self, cast: Cast) -> None:
+        """Every packet names its people by itself."""
+
     def remark(self) -> str:
         return _udp_remark(self.counts)
 
@@ -82,25 +90,37 @@ class UdpStream:
 
 
 class VmcStream:
-    """Each person to a port of their own."""
+    """Each person to a port of their own; who comes later gets the first that is free."""
 
     def __init__(self, target: Target, cast: Cast) -> None:
         self.target = target
         self.counts = Counts()
-        last = target.port + PORT_STEP * (len(cast) - 1)
-        if last > 65535:
-            raise InputError(
-                f"{target}: {len(cast)} people need ports up to {last}; choose a lower one"
-            )
-        self._ports = {name: target.port + PORT_STEP * i for i, name in enumerate(cast)}
-        self._senders = {
-            name: UdpSender(target.host, port, self.counts) for name, port in self._ports.items()
-        }
+        self._ports: dict[str, int] = {}
+        self._senders: dict[str, UdpSender] = {}
+        self.set_cast(cast)
 
     def send(self, frame: StreamFrame) -> None:
         for name, pose in frame.people.items():
-            for datagram in vmc_datagrams(pose, frame.time_s):
-                self._senders[name].send(datagram)
+            if name in self._senders:
+                for datagram in vmc_datagrams(pose, frame.time_s):
+                    self._senders[name].send(datagram)
+
+    def set_cast(self, cast: Cast) -> None:
+        """Opens ports for who is new and closes those of who is gone."""
+        last = self.target.port + PORT_STEP * (len(cast) - 1)
+        if last > 65535:
+            raise InputError(
+                f"{self.target}: {len(cast)} people need ports up to {last}; choose a lower one"
+            )
+        for name in [name for name in self._ports if name not in cast]:
+            del self._ports[name]
+            self._senders.pop(name).close()
+        usable = range(self.target.port, last + 1, PORT_STEP)
+        for name in cast:
+            if name not in self._ports:
+                port = next(port for port in usable if port not in self._ports.values())
+                self._senders[name] = UdpSender(self.target.host, port, self.counts)
+                self._ports[name] = port
 
     def remark(self) -> str:
         return _udp_remark(self.counts)
@@ -123,7 +143,8 @@ class WebSocketStream:
         self.target = target
         self.counts = Counts()
         self._server = WebSocketServer(target.host, target.port, self.counts)
-        self._server.publish_cast(cast_message(cast.items(), rate_hz))
+        self._rate_hz = rate_hz
+        self.set_cast(cast)
 
     def send(self, frame: StreamFrame) -> None:
         wants = self._server.wants
@@ -132,6 +153,10 @@ class WebSocketStream:
                 frame_text(frame) if False in wants else None,
                 frame_bytes(frame) if True in wants else None,
             )
+
+    def set_cast(self, cast: Cast) -> None:
+        """Tells every client."""
+        self._server.publish_cast(cast_message(cast.items(), self._rate_hz))
 
     def remark(self) -> str:
         if not self._server.clients_ever:
@@ -153,15 +178,25 @@ class LslStream:
     def __init__(self, target: Target, cast: Cast, rate_hz: float) -> None:
         self.target = target
         self.counts = Counts()
-        self._cast = cast
-        self._outlets = {
-            name: LslOutlet(name, shape.skeleton, rate_hz, self.counts)
-            for name, shape in cast.items()
-        }
+        self._rate_hz = rate_hz
+        self._skeletons: dict[str, Skeleton] = {}
+        self._outlets: dict[str, LslOutlet] = {}
+        check_lsl()
+        self.set_cast(cast)
 
     def send(self, frame: StreamFrame) -> None:
         for name, pose in frame.people.items():
-            self._outlets[name].send(lsl_sample(pose, self._cast[name].skeleton))
+            if name in self._outlets:
+                self._outlets[name].send(lsl_sample(pose, self._skeletons[name]))
+
+    def set_cast(self, cast: Cast) -> None:
+        """Opens outlets for who is new and closes those of who is gone."""
+        for name in [name for name in self._outlets if name not in cast]:
+            self._outlets.pop(name).close()
+        for name, shape in cast.items():
+            if name not in self._outlets:
+                self._skeletons[name] = shape.skeleton
+                self._outlets[name] = LslOutlet(name, shape.skeleton, self._rate_hz, self.counts)
 
     def remark(self) -> str:
         if any(outlet.heard for outlet in self._outlets.values()):

@@ -274,6 +274,11 @@ class LslOutlet:
         del self._outlet
 
 
+def check_lsl() -> None:
+    """Raises `InputError` where the LSL library is missing."""
+    _pylsl()
+
+
 def _describe(description: Any, channels: Iterable[LslChannel], person: str) -> None:
     description.append_child("acquisition").append_child_value("manufacturer", "fusecap")
     setup = description.append_child("setup")

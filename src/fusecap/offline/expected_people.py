@@ -1,9 +1,7 @@
-"""Where people are expected in each view before its next picture is looked at.
+"""Where people are expected in each view of a recording before its next picture is looked at.
 
-With calibrated cameras the whole pipeline runs along: everyone it follows is predicted to the next
-instant in the world and projected into every view, also into those that had lost them. Detections
-that belong to nobody it follows (newcomers, bystanders, false ones) are expected where they were.
-Without a calibration everyone is expected where they were.
+With calibrated cameras the whole pipeline runs along (`fusecap.online.expected`); without a
+calibration everyone is expected where they were.
 """
 
 from __future__ import annotations
@@ -13,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from fusecap.geometry.camera import Camera
+from fusecap.online.expected import expected_people
 from fusecap.pipeline import Pipeline, Step
 from fusecap.scene import Scene
 from fusecap.types import Detections
@@ -44,22 +42,7 @@ class ExpectedPeople:
         """
         if self._scene is None or self._pipeline is None:
             return self._people
-        names = {update.track_id: update.name for update in self._step.updates}
-        followed = {estimate.track_id for estimate in self._step.estimates}
-        points = []
-        for track_id in sorted(followed):
-            point = self._pipeline.estimator(names[track_id]).predict(now_ns)
-            if point is not None:
-                points.append(point)
-        expected = []
-        for index, camera in enumerate(self._scene.rig.cameras):
-            taken = {u.person[index].item() for u in self._step.updates if u.track_id in followed}
-            free = [n for n in range(len(self._people[index])) if n not in taken]
-            projected = [_projected(camera, point) for point in points]
-            visible = [p for p in projected if _is_in_view(camera, p)]
-            expected.append(np.concatenate([self._nobody, *(p[None] for p in visible)]))
-            expected[-1] = np.concatenate([expected[-1], self._people[index][free]])
-        return expected
+        return expected_people(self._scene.rig, self._pipeline, self._step, self._people, now_ns)
 
     def learn(self, now_ns: int, people: Sequence[Float[np.ndarray, "n k 3"] | None]) -> None:
         """Per camera who was seen at `now_ns`; None where it had no picture."""
@@ -83,14 +66,3 @@ def _pipeline(scene: Scene) -> Pipeline:
         subjects=scene.subjects,
         options=scene.options,
     )
-
-
-def _projected(camera: Camera, points_m: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:
-    pixels = camera.project(points_m)
-    return np.concatenate([pixels, np.isfinite(pixels).all(axis=1, keepdims=True)], axis=1)
-
-
-def _is_in_view(camera: Camera, person: Float[np.ndarray, "k 3"]) -> bool:
-    xy = person[np.isfinite(person[:, 0]), :2]
-    inside = np.all((xy >= -0.5) & (xy <= np.array(camera.size_px) - 0.5), axis=1)
-    return bool(inside.any())

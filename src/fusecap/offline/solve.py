@@ -130,7 +130,7 @@ def solve_instants(
             instants=len(take.timestamps_ns),
             duration_s=len(take.timestamps_ns) / scene.rate_hz,
             cameras=len(scene.rig),
-            subjects={name: _describe(take, s) for s, name in enumerate(take.subject_names)},
+            subjects=describe_subjects(take),
             reprojection_px=reprojection.summary(),
             solve_ms_median=float(np.median(solve_ms)),
             solve_ms_p99=float(np.percentile(solve_ms, 99)),
@@ -224,6 +224,11 @@ class _SecondPass:
             return estimate and (estimate, observation.keypoints)
 
         return [solved for solved in map(solve, updates) if solved]
+
+
+def describe_subjects(take: Take) -> dict[str, dict[str, float]]:
+    """As `SolveReport.subjects`."""
+    return {name: _describe(take, s) for s, name in enumerate(take.subject_names)}
 
 
 def _describe(take: Take, subject: int) -> dict[str, float]:

@@ -28,6 +28,8 @@ Progress = Callable[[int, int], None]
 
 MAX_FRAME = 10**9
 """Longer numbers are dates or serials."""
+MAX_FILE_BYTES = 4_000_000
+"""Of one frame; a thousand people with hands and faces are less."""
 
 _FRAME_NUMBER = re.compile(r"(\d+)(?:_keypoints)?$")
 
@@ -154,6 +156,8 @@ def _read_frame(path: str, landmarks: LandmarkSet) -> np.ndarray:
     count = len(landmarks.landmark_names)
     try:
         with open(path, "rb") as file:
+            if os.fstat(file.fileno()).st_size > MAX_FILE_BYTES:
+                raise _BrokenFile
             entries = json.load(file)["people"]
         flat = [entry["pose_keypoints_2d"] for entry in entries]
     except (ValueError, KeyError, TypeError, OSError, RecursionError):
@@ -166,7 +170,7 @@ def _read_frame(path: str, landmarks: LandmarkSet) -> np.ndarray:
             raise _wrong_count(path, landmarks, values)
     try:
         people = np.array(flat, dtype=np.float64).reshape(len(flat), count, 3)
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError):
         raise _BrokenFile from None
     return without_missing(people)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -28,8 +28,9 @@ from pydantic_core import PydanticCustomError
 from fusecap.body.landmarks import LANDMARK_SETS
 from fusecap.body.shape import MAX_HEIGHT_M, MIN_HEIGHT_M
 from fusecap.body.skeleton import Skeleton, skeleton_named
-from fusecap.errors import MotionError, SessionError, nearest
+from fusecap.errors import InputError, MotionError, SessionError, nearest
 from fusecap.sources.imu_calibration_files import read_imu_calibration
+from fusecap.sources.live_address import parse_camera_address, parse_imu_address
 
 FILE_NAME = "session.toml"
 KEYPOINT_FORMATS = tuple(f"openpose-{name}" for name in LANDMARK_SETS)
@@ -111,6 +112,17 @@ def _quaternion(values: tuple[float, float, float, float]) -> tuple[float, float
             {"norm": f"{norm:.3g}"},
         )
     return values
+
+
+def _address(parse: Callable[[str], object]) -> AfterValidator:
+    def check(value: str) -> str:
+        try:
+            parse(value)
+        except InputError as error:
+            raise PydanticCustomError("address", "{message}", {"message": str(error)}) from None
+        return value
+
+    return AfterValidator(check)
 
 
 def _resolved(path: Path, info: ValidationInfo) -> Path:
@@ -215,7 +227,7 @@ class CameraSettings(_Table):
     """None: the session's."""
     offset_s: Number = 0.0
     """Added to the camera's times (frame number / rate; live: the device's stamps)."""
-    live: Name | None = None
+    live: Annotated[Name, _address(parse_camera_address)] | None = None
     """Where `fusecap live` gets its pictures or keypoints (`fusecap.sources.live_address`)."""
 
     @model_validator(mode="after")
@@ -239,7 +251,7 @@ class ImuSettings(_Table):
 
     bone: Name
     file: File | None = None
-    live: Name | None = None
+    live: Annotated[Name, _address(parse_imu_address)] | None = None
     """Where `fusecap live` gets its samples (`fusecap.sources.live_address`)."""
     format: Annotated[str, _one_of(IMU_FORMATS)] = "csv"
     sensor: Name | None = None

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from fusecap.geometry.camera import Y_UP_FROM_Z_UP
 from fusecap.sources.imu_files.track import GRAVITY_M_S2, ImuTrack
@@ -31,30 +31,55 @@ GATE_HEIGHTS = 0.25
 """Two detections further apart than this share of a person's height are two people."""
 
 
+Frame = tuple[float, np.ndarray]
+"""When one camera looked [s], and the people (n, K, 3) it saw."""
+
+
 def people_at(track: KeypointTrack, t_s: float) -> np.ndarray:
     """(n, K, 3): the camera's people at `t_s`; empty where there is no frame near.
+
+    `people_amid` the frames around the instant; between frames that do not follow each other
+    nothing is interpolated.
+    """
+    after = int(np.searchsorted(track.times_s, t_s - EXACT_S))
+    before, last = after - 1, len(track.frames) - 1
+    in_a_row = 0 <= before < last and track.frames[after] == track.frames[before] + 1
+    found = people_amid(
+        (float(track.times_s[before]), track.people[before]) if before >= 0 else None,
+        (float(track.times_s[after]), track.people[after]) if after <= last else None,
+        t_s,
+        period_s=1.0 / track.rate_hz,
+        in_a_row=in_a_row,
+    )
+    return np.empty((0, len(track.landmarks.landmark_names), 3)) if found is None else found
+
+
+def people_amid(
+    before: Frame | None,
+    after: Frame | None,
+    t_s: float,
+    *,
+    period_s: float,
+    in_a_row: bool = True,
+) -> np.ndarray | None:
+    """(n, K, 3): people at `t_s` from a camera's last frame before it and the first not before it.
 
     A frame within 1 us is taken as it is. Between two frames keypoints that both have are
     interpolated; a keypoint or a person that only one of them has is missing. Where one of the
     neighbours does not exist, or the camera froze between them (more than 0.1 s and 2.5 of its
-    frame periods), the nearer holds for half a period.
+    frame periods), the nearer holds for half a period; None where neither is so near.
     """
-    period_s = 1.0 / track.rate_hz
-    max_gap_s = max(MAX_GAP_S, MAX_GAP_PERIODS * period_s)
-    after = int(np.searchsorted(track.times_s, t_s - EXACT_S))
-    nobody = np.empty((0, len(track.landmarks.landmark_names), 3))
-    if after < len(track.frames) and abs(track.times_s[after] - t_s) <= EXACT_S:
-        return track.people[after]
-    before = after - 1
-    neighbours = [i for i in (before, after) if 0 <= i < len(track.frames)]
-    if len(neighbours) == 2 and track.frames[after] == track.frames[before] + 1:
-        gap_s = float(track.times_s[after] - track.times_s[before])
-        if gap_s <= max_gap_s:
-            share = float(t_s - track.times_s[before]) / gap_s
-            return _between(track.people[before], track.people[after], share)
-    neighbours.sort(key=lambda i: abs(track.times_s[i] - t_s))
-    near = [i for i in neighbours if abs(track.times_s[i] - t_s) <= period_s / 2]
-    return track.people[near[0]] if near else nobody
+    if after is not None and abs(after[0] - t_s) <= EXACT_S:
+        return after[1]
+    if before is not None and after is not None and in_a_row:
+        gap_s = after[0] - before[0]
+        if gap_s <= max(MAX_GAP_S, MAX_GAP_PERIODS * period_s):
+            return _between(before[1], after[1], (t_s - before[0]) / gap_s)
+    neighbours = [frame for frame in (before, after) if frame is not None]
+    nearest = min(neighbours, key=lambda frame: abs(frame[0] - t_s), default=None)
+    if nearest is None or abs(nearest[0] - t_s) > period_s / 2:
+        return None
+    return nearest[1]
 
 
 def _between(first: np.ndarray, second: np.ndarray, share: float) -> np.ndarray:
@@ -109,19 +134,15 @@ def world_from_imu_world(imu_up: str, heading_deg: float) -> np.ndarray:
 def resample_imus(imus: Sequence[MountedImu], times_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Bone rotations (T, I, 3, 3) and accelerations without gravity (T, I, 3), in the world.
 
-        R_bone = R_ig R_i R_ib^-1           [1, eq. 8]
-        a = R_ig R_i a_i - g                [1, eq. 12]
-
     NaN outside a track and between samples more than `MAX_GAP_S` apart.
     """
     rotations = np.full((len(times_s), len(imus), 3, 3), np.nan)
     accelerations = np.full((len(times_s), len(imus), 3), np.nan)
     for i, imu in enumerate(imus):
         orientation, accel, valid = _resample(imu.track, times_s)
-        world_from_imu = imu.world_from_imu_world @ orientation
-        rotations[valid, i] = world_from_imu @ imu.bone_from_imu.T
-        accelerations[valid, i] = np.einsum("tij,tj->ti", world_from_imu, accel)
-        accelerations[:, i, 1] -= GRAVITY_M_S2
+        rotations[valid, i], accelerations[valid, i] = in_world(
+            orientation, accel, imu.world_from_imu_world, imu.bone_from_imu
+        )
     return rotations, accelerations
 
 
@@ -131,14 +152,49 @@ def readings_at(imus: Sequence[MountedImu], t_s: float) -> ImuReading:
     return ImuReading(bone_rotation_in_world=rotations[0], accel_in_world_m_s2=accelerations[0])
 
 
+def in_world(
+    orientation: np.ndarray,
+    accel_m_s2: np.ndarray,
+    world_from_imu_world: np.ndarray,
+    bone_from_imu: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Bone rotations (N, 3, 3) and accelerations without gravity (N, 3) from N measurements.
+
+        R_bone = R_ig R_i R_ib^-1           [1, eq. 8]
+        a = R_ig R_i a_i - g                [1, eq. 12]
+
+    `orientation` (N, 3, 3) is imu_world_from_imu, `accel_m_s2` (N, 3) the specific force; the
+    mounting is one for all (3, 3) or one each (N, 3, 3).
+    """
+    world_from_imu = world_from_imu_world @ orientation
+    accel = np.einsum("nij,nj->ni", world_from_imu, accel_m_s2)
+    accel[:, 1] -= GRAVITY_M_S2
+    return world_from_imu @ np.swapaxes(bone_from_imu, -1, -2), accel
+
+
+def orientations_between(
+    first_wxyz: np.ndarray, second_wxyz: np.ndarray, share: np.ndarray
+) -> np.ndarray:
+    """(N, 3, 3): `share` (N,) of the way from the first to the second orientation, by slerp."""
+    first = Rotation.from_quat(first_wxyz[:, [1, 2, 3, 0]])
+    second = Rotation.from_quat(second_wxyz[:, [1, 2, 3, 0]])
+    turn = (first.inv() * second).as_rotvec()
+    return (first * Rotation.from_rotvec(share[:, None] * turn)).as_matrix()
+
+
+def accels_between(first: np.ndarray, second: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """(N, 3): linearly; on a sample that sample alone, even where the other is NaN."""
+    accel = first + share[:, None] * (second - first)
+    return np.where(share[:, None] == 0, first, np.where(share[:, None] == 1, second, accel))
+
+
 def _resample(track: ImuTrack, times_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Orientations (V, 3, 3) and specific force (V, 3) at the V valid instants; their mask (T,)."""
     own = track.times_s
-    rotation = Rotation.from_quat(track.orientation_wxyz[:, [1, 2, 3, 0]])
     if len(own) == 1:
         valid = np.abs(times_s - own[0]) <= EXACT_S
         count = int(valid.sum())
-        once = rotation.as_matrix()
+        once = Rotation.from_quat(track.orientation_wxyz[:, [1, 2, 3, 0]]).as_matrix()
         return np.repeat(once, count, 0), np.repeat(track.accel_m_s2, count, 0), valid
     inside = (times_s >= own[0] - EXACT_S) & (times_s <= own[-1] + EXACT_S)
     clamped = np.clip(times_s, own[0], own[-1])
@@ -148,7 +204,6 @@ def _resample(track: ImuTrack, times_s: np.ndarray) -> tuple[np.ndarray, np.ndar
     valid = inside & ((gap <= MAX_GAP_S) | on_a_sample)
     after, clamped = after[valid], clamped[valid]
     share = (clamped - own[after - 1]) / (own[after] - own[after - 1])
-    first, second = track.accel_m_s2[after - 1], track.accel_m_s2[after]
-    accel = first + share[:, None] * (second - first)
-    accel = np.where(share[:, None] == 0, first, np.where(share[:, None] == 1, second, accel))
-    return Slerp(own, rotation)(clamped).as_matrix(), accel, valid
+    quaternion, accel = track.orientation_wxyz, track.accel_m_s2
+    orientation = orientations_between(quaternion[after - 1], quaternion[after], share)
+    return orientation, accels_between(accel[after - 1], accel[after], share), valid

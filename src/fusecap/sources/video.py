@@ -13,7 +13,7 @@ shown (phones store portrait videos lying on their side).
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -101,10 +101,13 @@ class Video:
         self.notes: tuple[str, ...] = self._cut_short(claimed, claimed_s)
         """What is odd about the file and was dealt with."""
 
-    def frames(self, first: int = 0) -> Iterator[VideoFrame]:
+    def frames(
+        self, first: int = 0, *, wanted: Callable[[int], bool] | None = None
+    ) -> Iterator[VideoFrame]:
         """Frames from number `first` on, the same as reading from the start would give.
 
-        Pictures that cannot be decoded are left out, also at the end of a truncated file.
+        Pictures that cannot be decoded are left out, also at the end of a truncated file, and those
+        whose number is not `wanted`; it is asked just before the picture is made.
         """
         if first >= len(self._pts):
             return
@@ -113,11 +116,13 @@ class Video:
                 break
             start = self._keyframe_at(first - earlier)
             if start is not None and start <= first:
-                yield from self._decoded(first, seek=first - earlier)
+                yield from self._decoded(first, wanted, seek=first - earlier)
                 return
-        yield from self._decoded(first, seek=None)
+        yield from self._decoded(first, wanted, seek=None)
 
-    def _decoded(self, first: int, *, seek: int | None) -> Iterator[VideoFrame]:
+    def _decoded(
+        self, first: int, wanted: Callable[[int], bool] | None, *, seek: int | None
+    ) -> Iterator[VideoFrame]:
         with _opened(self.path) as (container, stream):
             stream.thread_type = "AUTO"
             if seek is not None:
@@ -125,7 +130,7 @@ class Video:
             number = -1
             for frame in _pictures(container, stream):
                 number = self._number(frame, number)
-                if number < first:
+                if number < first or (wanted is not None and not wanted(number)):
                     continue
                 yield VideoFrame(
                     number=number, time_ns=int(self.times_ns[number]), image=self._image(frame)

@@ -13,8 +13,6 @@ and spine2 do together and everything above keeps its place in the world.
 
 from __future__ import annotations
 
-from pythonosc.osc_message import OscMessage
-
 from fusecap.body.skeleton import EXTENDED23
 from fusecap.sinks.streams.axes import UNITY
 from fusecap.sinks.streams.osc_packets import bundles, message
@@ -67,7 +65,7 @@ def vmc_datagrams(pose: PersonPose | None, time_s: float) -> list[bytes]:
     return bundles(messages)
 
 
-def _bones(pose: PersonPose) -> list[OscMessage]:
+def _bones(pose: PersonPose) -> list[bytes]:
     position_m, rotation = in_parents(
         _PARENTS, pose.bone_position_in_world_m[_BONES], pose.bone_rotation_in_world[_BONES]
     )

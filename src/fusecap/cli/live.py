@@ -1,0 +1,273 @@
+"""`fusecap live`."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from datetime import datetime
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fusecap.cli.common import Json, SessionPath, console, err, print_json, progress
+from fusecap.cli.targets import TO_HELP, placed_targets, warn_if_open
+from fusecap.errors import InputError
+
+if TYPE_CHECKING:
+    from fusecap.live.playback_sources import PlaybackOptions, Stall
+    from fusecap.live.record_switch import RecordSwitch
+    from fusecap.live.run import LiveRun
+    from fusecap.live.stream_process import RemoteOutput
+    from fusecap.live.target import Target
+    from fusecap.sources.session import Session
+    from fusecap.viewer.live import LiveViewer
+
+EXAMPLE = "Example: fusecap live studio --to vmc://127.0.0.1:39539 --to ws --view"
+
+
+def live(
+    session: SessionPath,
+    to: Annotated[list[str] | None, typer.Option(help=TO_HELP, show_default=False)] = None,
+    record: Annotated[
+        Path | None,
+        typer.Option(
+            help="The recording to write; default SESSION/<name>-<date>-<time>.mcap.",
+            show_default=False,
+        ),
+    ] = None,
+    no_record: Annotated[bool, typer.Option("--no-record", help="Record nothing.")] = False,
+    record_images: Annotated[
+        bool, typer.Option("--record-images", help="Also record the pictures, as JPEG.")
+    ] = False,
+    view: Annotated[bool, typer.Option(help="Serve a page that shows the run.")] = False,
+    host: Annotated[
+        str | None,
+        typer.Option(
+            help="Address on which ws and the page are served; 0.0.0.0 opens them to other "
+            "machines. Without, only this machine can connect.",
+            show_default=False,
+        ),
+    ] = None,
+    view_port: Annotated[
+        int | None, typer.Option(min=1, max=65535, help="Of the page.", show_default=False)
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.1, help="End after so many seconds; default: Ctrl-C.")
+    ] = None,
+    delay_ms: Annotated[
+        float | None,
+        typer.Option(
+            min=0,
+            max=5000,
+            help="Between exposure and solve, in milliseconds; default: as the session says, else "
+            "200 with a detector and 50 without.",
+        ),
+    ] = None,
+    playback: Annotated[
+        bool,
+        typer.Option(
+            "--playback", help="Play the session's recorded files as if they were devices."
+        ),
+    ] = False,
+    loop: Annotated[
+        bool, typer.Option("--loop", help="Of --playback: start again at the end.")
+    ] = False,
+    in_memory: Annotated[
+        bool,
+        typer.Option(
+            "--in-memory", help="Of --playback: decode the videos before the run, not during it."
+        ),
+    ] = False,
+    jitter_ms: Annotated[
+        float,
+        typer.Option(min=0, help="Of --playback: random delay of arrival, up to milliseconds."),
+    ] = 0.0,
+    loss: Annotated[
+        float, typer.Option(min=0, max=1, help="Of --playback: share of samples that get lost.")
+    ] = 0.0,
+    stall: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Of --playback: CAMERA:START:LENGTH in seconds, when a camera (or SUBJECT, or "
+            "SUBJECT/BONE) delivers nothing. Repeatable.",
+            show_default=False,
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Capture, solve and stream people in real time, from live cameras and sensors.
+
+    What the session's live keys name is opened; docs/live.md describes them, delay and faults.
+    Ctrl-C ends the run and leaves a whole recording.
+    """
+    from fusecap.cli.live_status import LiveLine, print_report
+    from fusecap.live.opening import check_live, open_setup, open_sources
+    from fusecap.live.record_switch import RecordSwitch
+    from fusecap.live.run import LiveOptions, LiveRun
+    from fusecap.live.source import SessionClock
+    from fusecap.sources.session import load_session
+
+    if no_record and (record is not None or record_images):
+        raise InputError("--no-record says that nothing is recorded; leave it or --record out")
+    if record is not None and record.suffix != ".mcap":
+        raise InputError(f"--record {record}: a recording is one .mcap file")
+    targets = placed_targets(to or [], host, other_servers=view)
+    loaded = load_session(session)
+    played = _playback(
+        playback,
+        loop=loop,
+        in_memory=in_memory,
+        jitter_ms=jitter_ms,
+        loss=loss,
+        stalls=stall or [],
+    )
+    missing = [] if played else check_live(loaded)
+    with progress(quiet=as_json) as show:
+        setup, detector = open_setup(loaded, playback=playback, progress=show)
+        clock = SessionClock()
+        sources = open_sources(loaded, clock, played, show)
+    options = LiveOptions(delay_s=None if delay_ms is None else 1e-3 * delay_ms)
+    run = LiveRun(setup, sources, detector, options, clock=clock)
+    try:
+        outputs = _add_outputs(run, targets)
+        switch = RecordSwitch(run, partial(recording_path, loaded), images=record_images)
+        path = None if no_record else switch.begin(record)
+        page = _add_viewer(run, switch, host, view_port) if view else None
+    except BaseException:
+        run.close()
+        raise
+    if not as_json:
+        _announce(run, outputs, path, page.address if page else None, missing)
+    for target in targets:
+        warn_if_open(target)
+    if page is not None and page.note:
+        err.print(f"[yellow]note[/] {page.note}", soft_wrap=True)
+    with _until_interrupted(run, quiet=as_json):
+        with LiveLine(run, quiet=as_json):
+            report = run.run(seconds)
+        if as_json:
+            print_json({**report.as_json(), "missing": missing})
+        else:
+            print_report(report)
+
+
+def _playback(
+    wanted: bool,
+    *,
+    loop: bool,
+    in_memory: bool,
+    jitter_ms: float,
+    loss: float,
+    stalls: Sequence[str],
+) -> PlaybackOptions | None:
+    from fusecap.live.playback_sources import PlaybackOptions
+
+    if not wanted:
+        if loop or in_memory or jitter_ms or loss or stalls:
+            raise InputError(
+                "--loop, --in-memory, --jitter-ms, --loss and --stall are about recorded files; "
+                "add --playback"
+            )
+        return None
+    return PlaybackOptions(
+        loop=loop,
+        in_memory=in_memory,
+        jitter_ms=jitter_ms,
+        loss=loss,
+        stalls=tuple(_stall(text) for text in stalls),
+    )
+
+
+def _stall(text: str) -> Stall:
+    from fusecap.live.playback_sources import Stall
+
+    source, *numbers = text.rsplit(":", 2)
+    try:
+        start_s, length_s = map(float, numbers)
+    except ValueError:
+        raise InputError(
+            f"--stall {text}: expected CAMERA:START:LENGTH with seconds, as in left:10:2.5"
+        ) from None
+    if not source or not start_s >= 0 or not length_s > 0:
+        raise InputError(f"--stall {text}: expected a name, a start from 0 and a length above 0")
+    return Stall(source=source, start_s=start_s, length_s=length_s)
+
+
+def _add_outputs(run: LiveRun, targets: Sequence[Target]) -> tuple[RemoteOutput, ...]:
+    if not targets:
+        return ()
+    from fusecap.live.outputs import first_cast
+    from fusecap.live.stream_process import StreamProcess
+
+    streams = StreamProcess(targets, first_cast(run.setup), run.rate_hz, run.clock, run.latency)
+    for listener in (streams, *streams.outputs):
+        run.add_listener(listener)
+    return streams.outputs
+
+
+def recording_path(session: Session) -> Path:
+    """A name of its own for each recording, beside the session."""
+    from fusecap.sinks.files import safe_name
+
+    now = datetime.now().strftime("%Y-%m-%d-%H%M%S")
+    return session.folder / f"{safe_name(session.settings.name)}-{now}.mcap"
+
+
+def _add_viewer(
+    run: LiveRun, switch: RecordSwitch, host: str | None, port: int | None
+) -> LiveViewer:
+    from fusecap.viewer.live import LiveViewer
+
+    viewer = LiveViewer(run.setup, run, host or "127.0.0.1", port, on_record=switch.turn)
+    run.add_listener(viewer)
+    return viewer
+
+
+def _announce(
+    run: LiveRun,
+    outputs: Sequence[RemoteOutput],
+    path: Path | None,
+    page: str | None,
+    missing: Sequence[str],
+) -> None:
+    session = run.setup.session
+    sensors = sum(len(subject.imus) for subject in session.subjects)
+    pace = ", or sooner where all is there" if run.eager else ""
+    lines = [
+        f"{session.settings.name}: {len(session.cameras)} cameras, {len(session.subjects)} people "
+        f"with {sensors} sensors; {run.rate_hz:g} instants/s, each solved "
+        f"{1e3 * run.delay_s:.0f} ms after exposure{pace}; Ctrl-C ends it"
+    ]
+    for output in outputs:
+        where = output.where() or {"everyone": output.stream_status().to}
+        lines += [f"  {name} -> {address}" for name, address in where.items()]
+    if path is not None:
+        lines.append(f"  recording -> {path}")
+    if page is not None:
+        lines.append(f"  page -> {page}")
+    for line in lines:
+        console.print(line, markup=False, soft_wrap=True)
+    if missing:
+        err.print(
+            f"[yellow]note[/] no live key, and so not used: {', '.join(missing)}", soft_wrap=True
+        )
+
+
+@contextmanager
+def _until_interrupted(run: LiveRun, *, quiet: bool) -> Iterator[None]:
+    """Ctrl-C and SIGTERM end the run; a second one does not cut its end short."""
+
+    def end(number: int, frame: object) -> None:
+        run.stop()
+        if not quiet:
+            err.print("ending: closing devices, streams and the recording")
+
+    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

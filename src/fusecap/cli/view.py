@@ -1,0 +1,154 @@
+"""`fusecap view`."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fusecap.cli.common import Json, console, err, print_json
+
+if TYPE_CHECKING:
+    from fusecap.geometry.camera import Rig
+    from fusecap.sinks.take import Take
+    from fusecap.viewer.curves import Curve
+    from fusecap.viewer.page import Page
+    from fusecap.viewer.recording import RecordedDetections
+
+EXAMPLE = "Example: fusecap view demo/demo.npz --truth scene/truth.npz --session scene"
+
+Port = Annotated[
+    int | None,
+    typer.Option(min=1, max=65535, help="Of the page; without, the first free one from 8080 on."),
+]
+Host = Annotated[
+    str,
+    typer.Option(
+        help="Address on which the page is served; 0.0.0.0 opens it to other machines. Without, "
+        "only this machine can look."
+    ),
+]
+NoBrowser = Annotated[bool, typer.Option("--no-browser", help="Only print the page's address.")]
+
+
+def view(
+    take: Annotated[
+        Path,
+        typer.Argument(
+            help="A solved take (.npz) or a live recording (.mcap).", show_default=False
+        ),
+    ],
+    session: Annotated[
+        Path | None, typer.Option(help="Its session.toml or folder: shows the cameras.")
+    ] = None,
+    truth: Annotated[
+        Path | None, typer.Option(help="A take of the true motion: plots the errors.")
+    ] = None,
+    port: Port = None,
+    host: Host = "127.0.0.1",
+    no_browser: NoBrowser = False,
+    as_json: Json = False,
+) -> None:
+    """Look at a take or a recording in a browser: play, pause, scrub, from all sides.
+
+    Nothing leaves this machine. Ctrl-C ends it.
+    """
+    from fusecap.sinks.take import load_take
+    from fusecap.sources.recording import SUFFIX
+    from fusecap.sources.session import parse_session
+    from fusecap.sources.session_data import open_rig
+
+    detections = None
+    if take.suffix == SUFFIX:
+        loaded, detections = _recorded(take)
+    else:
+        loaded = load_take(take)
+    rig = None if session is None else open_rig(parse_session(session))[0]
+    if rig is None and detections is not None:
+        rig = detections.setup.rig
+    curves = [] if truth is None else error_curves(loaded, load_take(truth))
+    look(
+        loaded,
+        f"fusecap view {take.name}",
+        rig=rig,
+        curves=curves,
+        detections=detections,
+        host=host,
+        port=port,
+        browser=not no_browser,
+        as_json=as_json,
+    )
+
+
+def error_curves(take: Take, truth: Take) -> list[Curve]:
+    """Of positions and orientations; raises `TakeError` where the two have nothing in common."""
+    from fusecap.evaluate.errors_over_time import errors_over_time
+    from fusecap.viewer.curves import Curve
+
+    errors = errors_over_time(take, truth)
+    return [
+        Curve(title="position error (mm)", by_person=errors.position_mm),
+        Curve(title="orientation error (degrees)", by_person=errors.orientation_deg),
+    ]
+
+
+def look(
+    take: Take,
+    title: str,
+    *,
+    rig: Rig | None,
+    curves: Sequence[Curve],
+    detections: RecordedDetections | None = None,
+    host: str = "127.0.0.1",
+    port: int | None = None,
+    browser: bool = True,
+    as_json: bool = False,
+) -> None:
+    """Serve a page until Ctrl-C, which is how it is closed and so no failure."""
+    from fusecap.viewer.page import Page
+    from fusecap.viewer.take import TakePage
+
+    page = Page(title, host=host, port=port)
+    try:
+        shown = TakePage(page, take, rig=rig, curves=curves, detections=detections)
+        _announce(page, browser=browser, as_json=as_json)
+        with suppress(KeyboardInterrupt):
+            shown.run(threading.Event())
+    finally:
+        page.stop()
+
+
+def _recorded(path: Path) -> tuple[Take, RecordedDetections | None]:
+    """The poses of a recording, and its detections where it has cameras."""
+    from fusecap.offline.replay import loss_notes, recorded_setup, recorded_take
+    from fusecap.sources.recording import Recording
+    from fusecap.viewer.recording import RecordedDetections
+
+    recording = Recording(path)
+    take = recorded_take(recording)
+    for note in loss_notes(recording):
+        err.print(f"[yellow]note[/] {note}", soft_wrap=True)
+    setup = recorded_setup(recording)
+    return take, RecordedDetections(recording, setup) if len(setup.rig) else None
+
+
+def _announce(page: Page, *, as_json: bool, browser: bool) -> None:
+    """Says where the page is, who can reach it, and opens it."""
+    import webbrowser
+
+    from fusecap.viewer.page import note_if_open
+
+    note = note_if_open(page)
+    if as_json:
+        print_json({"address": page.address, "open": page.is_open})
+    else:
+        who = "" if page.is_open else " (only from this machine)"
+        console.print(f"watch at {page.address}{who}; Ctrl-C ends it", soft_wrap=True)
+    if note:
+        err.print(f"[yellow]note[/] {note}", soft_wrap=True)
+    if browser:
+        webbrowser.open(page.address)

@@ -1,0 +1,221 @@
+"""The thread that owns the engine: what has arrived goes in, and at each instant a pose comes out.
+
+Instant k is the time k / rate on the session's clock. It is solved `delay` after that, so that what
+was exposed then has come through the detector; or sooner, where `eager`, as soon as every source
+that is fresh has a sample from then or later. An instant that is late is still solved when the one
+after it is not due yet; who is further behind goes on with the newest instant that is due, and what
+lies between is counted as skipped. So a machine that is too slow loses instants, never its delay.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from fusecap.live.health import Meter
+from fusecap.live.inbox import Inbox
+from fusecap.live.latency import (
+    EXPOSURE_TO_POSE,
+    LAST_SAMPLE_TO_SOLVE,
+    SOLVE,
+    Arrivals,
+    LatencyBook,
+)
+from fusecap.live.source import SessionClock
+from fusecap.online.step import LiveStep
+from fusecap.types import Command, Event, Tick
+
+_EARLY_NS = 1_000_000
+"""Before an instant is due, samples that wait are taken: it leaves less to do when it is."""
+_LOOK_AGAIN_NS = 1_000_000
+"""Between two looks whether an instant is ready; a burst of samples is one look."""
+_LATE_PERIODS = 0.5
+_PEOPLE = 100
+"""Of whom a tally is kept."""
+
+
+class LiveEngine(Protocol):
+    """What turns events into poses; holds no clock (`fusecap.online.engine.Engine`)."""
+
+    @property
+    def notes(self) -> deque[str]:
+        """What happened, in words; whoever reads them takes them out."""
+        ...
+
+    def take(self, event: Event) -> LiveStep | None:
+        """One event; a step where it was a tick."""
+        ...
+
+    def ready(self, timestamp_ns: int) -> bool:
+        """Every fresh source has a sample at or after this time."""
+        ...
+
+    def expected(self, timestamp_ns: int) -> Sequence[np.ndarray]:
+        """Per camera (m, k, 3) the people expected in its image."""
+        ...
+
+
+@dataclass(slots=True)
+class PersonTally:
+    """One person over a run."""
+
+    instants: int = 0
+    """With a pose to send."""
+    measured: int = 0
+    """With a pose that was solved, not held."""
+    quality: float = 0.0
+    """Sum over instants of the mean over bones."""
+
+
+class Solving:
+    """Solves instants on one thread until stopped."""
+
+    def __init__(
+        self,
+        engine: LiveEngine,
+        inbox: Inbox,
+        *,
+        rate_hz: float,
+        delay_ns: int,
+        eager: bool,
+        clock: SessionClock,
+        latency: LatencyBook,
+        on_event: Callable[[Event, int], None],
+        on_step: Callable[[LiveStep, int], None],
+        expect: Callable[[Sequence[np.ndarray]], None] | None,
+        failed: Callable[[Exception], None],
+    ) -> None:
+        """`expect` takes where people are expected, for a detector.
+
+        `failed` takes what the engine raised; the thread goes on with the next event.
+        """
+        self.solves = Meter()
+        self.skipped = 0
+        self.late = 0
+        self.failures = 0
+        """Events that the engine raised on, which is a fault of fusecap."""
+        self.looked = 0
+        """Instants for which some camera looked."""
+        self.complete = 0
+        """Those for which every camera that looked had samples on both sides."""
+        self.people: dict[str, PersonTally] = {}
+        self._engine = engine
+        self._inbox = inbox
+        self._rate_hz = rate_hz
+        self._delay_ns = delay_ns
+        self._eager = eager
+        self._clock = clock
+        self._latency = latency
+        self._on_event = on_event
+        self._on_step = on_step
+        self._expect = expect
+        self._failed = failed
+        self._arrivals = Arrivals()
+        self._stopping = threading.Event()
+        self.name = "the solver"
+        self._thread = threading.Thread(target=self._run, name="fusecap-solver", daemon=True)
+
+    def start(self) -> None:
+        """Begin with the next instant."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End before the next instant; does not wait."""
+        self._stopping.set()
+        self._inbox.wake()
+
+    def join(self, timeout_s: float) -> bool:
+        """Whether the thread has ended by then."""
+        if self._thread.ident is not None:
+            self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        instant = int(1e-9 * self._clock.now_ns() * self._rate_hz) + 1
+        while self._wait_for(instant):
+            timestamp_ns = self._time_ns(instant)
+            lateness_ns = self._clock.now_ns() - timestamp_ns - self._delay_ns
+            self.late += lateness_ns > _LATE_PERIODS * 1e9 / self._rate_hz
+            self._solve(timestamp_ns)
+            newest = int(1e-9 * (self._clock.now_ns() - self._delay_ns) * self._rate_hz)
+            following = newest if newest > instant + 2 else instant + 1
+            self.skipped += following - instant - 1
+            instant = following
+
+    def _time_ns(self, instant: int) -> int:
+        return round(instant * 1e9 / self._rate_hz)
+
+    def _wait_for(self, instant: int) -> bool:
+        """Take what arrives until the instant can be solved; False at the end of the run."""
+        timestamp_ns = self._time_ns(instant)
+        due_ns = timestamp_ns + self._delay_ns
+        if not self._eager:
+            self._inbox.wait_until(due_ns - _EARLY_NS)
+            self._take_waiting()
+        while not self._stopping.is_set():
+            now_ns = self._clock.now_ns()
+            if self._eager and now_ns < timestamp_ns:
+                self._inbox.wait_until(timestamp_ns)
+                continue
+            self._take_waiting()
+            if now_ns >= due_ns or (self._eager and self._engine.ready(timestamp_ns)):
+                return True
+            if self._eager:
+                self._inbox.wait_until(min(due_ns, now_ns + _LOOK_AGAIN_NS))
+            self._inbox.wait_until(due_ns, or_arrival=self._eager)
+        return False
+
+    def _take_waiting(self) -> None:
+        for event, arrival_ns in self._inbox.take_all():
+            self._engine_takes(event)
+            if not isinstance(event, Command):
+                self._arrivals.note(event, arrival_ns)
+            self._on_event(event, arrival_ns)
+
+    def _solve(self, timestamp_ns: int) -> None:
+        start_ns = self._clock.now_ns()
+        tick = Tick(timestamp_ns=timestamp_ns)
+        step = self._engine_takes(tick)
+        end_ns = self._clock.now_ns()
+        self._on_event(tick, start_ns)
+        if step is None:
+            return
+        last_arrival_ns, both_sides = self._arrivals.instant(timestamp_ns)
+        self._latency.solved(timestamp_ns, last_arrival_ns)
+        self._on_step(step, end_ns)
+        self._latency.add(SOLVE, end_ns - start_ns)
+        self._latency.add(EXPOSURE_TO_POSE, end_ns - timestamp_ns)
+        if last_arrival_ns is not None:
+            self._latency.add(LAST_SAMPLE_TO_SOLVE, start_ns - last_arrival_ns)
+        self._tally(step, both_sides, end_ns)
+        if self._expect is not None:
+            self._expect(self._engine.expected(self._clock.now_ns()))
+
+    def _engine_takes(self, event: Event) -> LiveStep | None:
+        try:
+            return self._engine.take(event)
+        except Exception as error:  # one bad event must not end a run of hours
+            self.failures += 1
+            self._failed(error)
+            return None
+
+    def _tally(self, step: LiveStep, both_sides: set[int], now_ns: int) -> None:
+        self.solves.add(now_ns)
+        cameras = len(step.detections.people)
+        looked = step.detections.looked or (True,) * cameras
+        looking = {camera for camera in range(cameras) if looked[camera]}
+        self.looked += bool(looking)
+        self.complete += bool(looking) and looking <= both_sides
+        measured = {estimate.name for estimate in step.step.estimates}
+        for name, estimate in step.people.items():
+            if estimate is None or (name not in self.people and len(self.people) >= _PEOPLE):
+                continue
+            tally = self.people.setdefault(name, PersonTally())
+            tally.instants += 1
+            tally.measured += name in measured
+            tally.quality += float(estimate.bone_quality.mean())

@@ -1,0 +1,416 @@
+"""Reads the MCAP log of a live run, also one that was cut off or damaged.
+
+Reading goes from record to record and stops at the first that the file does not hold whole; a
+chunk that fails its checksum is left out. Events carry their number among all events, so whatever
+is missing is known. Nothing in a file is executed, and no length in it is believed beyond the size
+of the file, or 256 MiB for what a chunk unpacks to.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import struct
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import zstandard
+from jaxtyping import Float
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, Message, Metadata, Schema
+
+from fusecap.body.shape import BodyShape
+from fusecap.body.skeleton import skeleton_named
+from fusecap.errors import InputError, MotionError
+from fusecap.types import CameraSample, Command, CommandKind, Event, ImuSample, Tick
+
+SUFFIX = ".mcap"
+FORMAT = "fusecap recording 1"
+MAX_BYTES = 256 << 20
+"""Of one record, and of what a chunk unpacks to."""
+_MAGIC = b"\x89MCAP0\r\n"
+_HEADER, _END = "fusecap", "fusecap end"
+_RECORD = struct.Struct("<BQ")
+_BROKEN = (
+    ValueError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    OverflowError,
+    RecursionError,
+    struct.error,
+    McapError,
+)
+"""What parsing bytes that are not what they should be may raise."""
+
+_Record = Schema | Channel | Message | Metadata
+
+Progress = Callable[[int, int], None]
+"""Called with (bytes read, bytes in all)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordedEvent:
+    """One event and when it was taken."""
+
+    event: Event
+    number: int
+    """Among all events of the run's recording, from 1."""
+    arrival_ns: int
+    """On the session's clock."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordedPose:
+    """One person's pose as it was sent."""
+
+    name: str
+    number: int
+    """Of the tick it belongs to, among all events."""
+    timestamp_ns: int
+    theta: Float[np.ndarray, " p"]
+    bone_quality: Float[np.ndarray, " b"]
+    diverged: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordedBody:
+    """A person's body from now on."""
+
+    name: str
+    shape: BodyShape
+
+
+Item = RecordedEvent | RecordedPose | RecordedBody
+
+
+@dataclass(kw_only=True)
+class Loss:
+    """What a file no longer holds; complete once all items have been read."""
+
+    finished: bool = False
+    """Has its footer: it was closed, not cut off."""
+    note: str = ""
+    """Why the recording ended before it was asked to."""
+    unread_bytes: int = 0
+    """At the end, after the last whole record."""
+    broken_chunks: int = 0
+    malformed: int = 0
+    """Messages that do not follow the format."""
+    missing_events: int = 0
+    """By their numbers; those after the end cannot be known."""
+
+    @property
+    def whole(self) -> bool:
+        """No event is missing among those that were read."""
+        return self.missing_events == 0
+
+
+class Recording:
+    """A log whose header has been read; raises `InputError` for anything else."""
+
+    def __init__(self, path: Path | str) -> None:
+        self.path = Path(path)
+        self.loss = Loss()
+        """Of the latest reading."""
+        header = self._header()
+        found = header.get("format", "")
+        if found != FORMAT:
+            raise InputError(
+                f"{self.path} is a '{found}', this version reads '{FORMAT}'; update fusecap"
+            )
+        try:
+            self.made_by = header["made_by"]
+            self.from_start = header["from_start"] == "true"
+            """Whether it holds the run from its first event."""
+            self.unix_minus_session_ns = int(header["unix_minus_session_ns"])
+            if zlib.crc32(header["setup"].encode()) != int(header["setup_crc32"]):
+                raise ValueError("what the run knew fails its checksum")
+            self.setup: Mapping[str, Any] = json.loads(header["setup"])
+            """Plain values: what the run knew before the first event."""
+            self._known = _Known.of(self.setup)
+        except _BROKEN as error:
+            raise InputError(f"{self.path}: its header is damaged ({error!r})") from None
+
+    def items(self, progress: Progress | None = None) -> Iterator[Item]:
+        """Everything in the order in which it was recorded; `loss` counts what is not there."""
+        self.loss = loss = Loss()
+        schemas: dict[int, str] = {}
+        channels: dict[int, str] = {}
+        numbers = _Numbers()
+        with self._opened() as file:
+            for opcode, payload in self._records(file, loss, progress):
+                try:
+                    records = list(_inside(opcode, payload))
+                except (*_BROKEN, zstandard.ZstdError, MemoryError):
+                    loss.broken_chunks += 1
+                    continue
+                for record in records:
+                    match record:
+                        case Schema():
+                            schemas[record.id] = record.name
+                        case Channel():
+                            channels[record.id] = schemas.get(record.schema_id, "")
+                        case Metadata() if record.name == _END:
+                            loss.note = record.metadata.get("note", "")
+                            events = record.metadata.get("events", "")
+                            if events.isdecimal() and len(events) < 19:
+                                numbers.state(int(events))
+                        case Message():
+                            item = self._item(channels.get(record.channel_id, ""), record, numbers)
+                            if item is not None:
+                                yield item
+        loss.missing_events = numbers.missing
+
+    def sha256(self) -> str:
+        """Of the file."""
+        with self.path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+
+    def _item(self, schema: str, message: Message, numbers: _Numbers) -> Item | None:
+        decode = _DECODERS.get(schema)
+        if decode is None:
+            self.loss.malformed += not schema
+            return None
+        try:
+            values = json.loads(message.data)
+            decoded = decode(values, self._known)
+            if isinstance(decoded, Event):
+                numbers.take(message.sequence)
+                return RecordedEvent(
+                    event=decoded,
+                    number=message.sequence,
+                    arrival_ns=message.log_time - self.unix_minus_session_ns,
+                )
+            if isinstance(decoded, RecordedBody):
+                return decoded
+            return RecordedPose(number=message.sequence, **decoded)
+        except (*_BROKEN, MotionError, InputError):
+            self.loss.malformed += 1
+            return None
+
+    def _header(self) -> dict[str, str]:
+        with self._opened() as file:
+            try:
+                for opcode, payload in self._records(file, Loss(), None):
+                    if opcode == Opcode.METADATA:
+                        record = Metadata.read(ReadDataStream(BytesIO(payload)))
+                        if record.name == _HEADER:
+                            return record.metadata
+                    if opcode == Opcode.CHUNK:
+                        break
+            except _BROKEN:
+                pass
+        raise InputError(
+            f"{self.path} holds no recording of fusecap: an MCAP log without its header, or cut "
+            "off before it"
+        )
+
+    def _opened(self) -> BinaryIO:
+        try:
+            return self.path.open("rb")
+        except FileNotFoundError:
+            raise InputError(f"there is no recording at {self.path}") from None
+        except OSError as error:
+            raise InputError(f"cannot read {self.path}: {error.strerror or error}") from None
+
+    def _records(
+        self, file: BinaryIO, loss: Loss, progress: Progress | None
+    ) -> Iterator[tuple[int, bytes]]:
+        """Opcode and content of every record that is there whole, up to the end of the data."""
+        size = self.path.stat().st_size
+        if file.read(len(_MAGIC)) != _MAGIC:
+            raise InputError(f"{self.path} is not an MCAP log: its first bytes are others")
+        at = len(_MAGIC)
+        while len(head := file.read(_RECORD.size)) == _RECORD.size:
+            opcode, length = _RECORD.unpack(head)
+            if opcode == Opcode.DATA_END and length == 4:
+                loss.finished = True
+                return
+            if length > min(MAX_BYTES, size - at - _RECORD.size):
+                break
+            yield opcode, file.read(length)
+            at += _RECORD.size + length
+            if progress is not None:
+                progress(at, size)
+        loss.unread_bytes = size - at
+
+
+class _Numbers:
+    """Which event numbers have come; in the file they start again after 2**32."""
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._last = 0
+        self._stated = 0
+
+    def take(self, number: int) -> None:
+        """Raises `ValueError` for one that is not after the last."""
+        ahead = (number - self._last) & 0xFFFFFFFF
+        if not 0 < ahead < 0x80000000:
+            raise ValueError("an event twice")
+        self._last += ahead
+        self._count += 1
+
+    def state(self, count: int) -> None:
+        """So many events were recorded in all."""
+        self._stated = count
+
+    @property
+    def missing(self) -> int:
+        """Events that did not come."""
+        return max(self._last, self._stated) - self._count
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Known:
+    """What samples must fit to."""
+
+    cameras: int
+    landmarks: int
+    sensors: frozenset[tuple[str, str]]
+    skeleton: str
+
+    @classmethod
+    def of(cls, setup: Mapping[str, Any]) -> _Known:
+        session = setup["session"]
+        return cls(
+            cameras=len(setup["rig"]),
+            landmarks=len(setup["landmarks"]["landmark_names"]),
+            sensors=frozenset(
+                (subject["name"], imu["bone"])
+                for subject in session.get("subject", ())
+                for imu in subject.get("imu", ())
+            ),
+            skeleton=session["session"].get("skeleton", "paper21"),
+        )
+
+
+def _inside(opcode: int, content: bytes) -> Iterator[_Record]:
+    """The records of a chunk, or the record itself, as far as they matter here."""
+    if opcode != Opcode.CHUNK:
+        yield from _parsed(opcode, content)
+        return
+    data = _unpacked(Chunk.read(ReadDataStream(BytesIO(content))))
+    at = 0
+    while at < len(data):
+        kind, length = _RECORD.unpack_from(data, at)
+        at += _RECORD.size + length
+        if at > len(data):
+            raise ValueError("a record longer than its chunk")
+        yield from _parsed(kind, data[at - length : at])
+
+
+def _parsed(opcode: int, content: bytes) -> Iterator[_Record]:
+    stream = ReadDataStream(BytesIO(content))
+    if opcode == Opcode.MESSAGE:
+        yield Message.read(stream, len(content))
+    elif opcode == Opcode.CHANNEL:
+        yield Channel.read(stream)
+    elif opcode == Opcode.SCHEMA:
+        yield Schema.read(stream)
+    elif opcode == Opcode.METADATA:
+        yield Metadata.read(stream)
+
+
+def _unpacked(chunk: Chunk) -> bytes:
+    size = chunk.uncompressed_size
+    data = chunk.data
+    if chunk.compression == "zstd":
+        stated = zstandard.get_frame_parameters(data).content_size
+        if max(size, stated) > MAX_BYTES:
+            raise ValueError(f"a chunk of {max(size, stated)} bytes")
+        data = zstandard.ZstdDecompressor(max_window_size=MAX_BYTES).decompress(data, size)
+    elif chunk.compression:
+        raise ValueError(f"compressed with '{chunk.compression}'")
+    if len(data) != size or chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+        raise ValueError("a chunk that fails its checksum")
+    return data
+
+
+def _keypoints(values: Mapping[str, Any], known: _Known) -> CameraSample:
+    camera = _number(values["camera"])
+    if not 0 <= camera < known.cameras:
+        raise ValueError(f"no camera {camera}")
+    people = np.array(values["people"], dtype=np.float64)
+    if people.size == 0:
+        people = people.reshape(0, known.landmarks, 3)
+    if people.shape[1:] != (known.landmarks, 3):
+        raise ValueError(f"keypoints {people.shape}")
+    return CameraSample(camera=camera, timestamp_ns=_time_ns(values), people=people)
+
+
+def _imu(values: Mapping[str, Any], known: _Known) -> ImuSample:
+    subject, bone = values["subject"], values["bone"]
+    if (subject, bone) not in known.sensors:
+        raise ValueError(f"no sensor {subject}/{bone}")
+    return ImuSample(
+        subject=subject,
+        bone=bone,
+        timestamp_ns=_time_ns(values),
+        orientation_wxyz=_floats(values["orientation_wxyz"], 4),
+        accel_m_s2=_floats(values["accel_m_s2"], 3),
+    )
+
+
+def _command(values: Mapping[str, Any], known: _Known) -> Command:
+    return Command(kind=CommandKind(values["kind"]), subject=str(values["subject"]))
+
+
+def _tick(values: Mapping[str, Any], known: _Known) -> Tick:
+    return Tick(timestamp_ns=_time_ns(values))
+
+
+def _pose(values: Mapping[str, Any], known: _Known) -> dict[str, Any]:
+    skeleton = skeleton_named(known.skeleton)
+    return {
+        "name": str(values["name"]),
+        "timestamp_ns": _time_ns(values),
+        "theta": _floats(values["theta"], skeleton.pose_size),
+        "bone_quality": _floats(values["bone_quality"], skeleton.bone_count),
+        "diverged": values["status"] == "diverged",
+    }
+
+
+def _body(values: Mapping[str, Any], known: _Known) -> RecordedBody:
+    shape = BodyShape(
+        skeleton=skeleton_named(known.skeleton),
+        offsets_m=np.array(values["offsets_m"], dtype=np.float64),
+        height_m=float(values["height_m"]),
+    )
+    return RecordedBody(name=str(values["name"]), shape=shape)
+
+
+_DECODERS: dict[str, Callable[[Mapping[str, Any], _Known], Any]] = {
+    "fusecap.Keypoints": _keypoints,
+    "fusecap.Imu": _imu,
+    "fusecap.Command": _command,
+    "fusecap.Tick": _tick,
+    "fusecap.Pose": _pose,
+    "fusecap.Body": _body,
+}
+
+
+def _time_ns(values: Mapping[str, Any]) -> int:
+    return _number(values["timestamp_ns"])
+
+
+def _number(value: Any) -> int:
+    number = int(value)
+    if abs(number) >= 1 << 62:
+        raise ValueError(f"{number} is no time")
+    return number
+
+
+def _floats(values: Any, count: int) -> np.ndarray:
+    array = np.array(values, dtype=np.float64)
+    if array.shape != (count,):
+        raise ValueError(f"{array.shape} numbers, expected {count}")
+    return array

@@ -1,0 +1,118 @@
+"""What is plotted over time: a curve per person, with a line at the present."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import viser
+import viser.uplot
+from jaxtyping import Float
+
+from fusecap.sinks.take import Take
+from fusecap.viewer.palette import Rgb, css
+
+ALL_BONES = "all bones (mean)"
+_POINTS = 400
+"""Of a drawn curve; a plot is about as many pixels wide."""
+_HEIGHT_PX = 170
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Curve:
+    """One value per bone and frame, for each person."""
+
+    title: str
+    """With its unit."""
+    by_person: Mapping[str, Float[np.ndarray, "t b"]]
+    """NaN where there is none."""
+    top: float | None = None
+    """Of the axis; None: of the data."""
+
+
+def quality_curve(take: Take) -> Curve:
+    """0-1; the share of a bone's orientation uncertainty that data removed."""
+    return Curve(
+        title="bone quality (0 to 1)",
+        by_person=dict(zip(take.subject_names, take.bone_quality, strict=True)),
+        top=1.03,
+    )
+
+
+class Plot:
+    """A curve on a page."""
+
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        curve: Curve,
+        time_s: Float[np.ndarray, " t"],
+        bone_names: Sequence[str],
+        colours: Mapping[str, Rgb],
+    ) -> None:
+        self._curve = curve
+        self._bone_names = list(bone_names)
+        self._rows = np.unique(np.linspace(0, len(time_s) - 1, _POINTS).astype(int))
+        self._time_s = time_s[self._rows]
+        self._drawn = self._data(ALL_BONES)
+        self._now = -1
+        self._handle = gui.add_uplot(
+            self._with_now(0),
+            (
+                viser.uplot.Series(label="time (s)"),
+                *(
+                    viser.uplot.Series(label=name, stroke=css(colours[name]), width=1.6)
+                    for name in curve.by_person
+                ),
+                viser.uplot.Series(label="now", stroke="#333333", width=1.0),
+            ),
+            title=curve.title,
+            scales={
+                "x": viser.uplot.Scale(time=False),
+                "y": viser.uplot.Scale(range=(0.0, self._top())),
+            },
+            legend=viser.uplot.Legend(show=False),
+            height=_HEIGHT_PX,
+        )
+
+    def choose(self, bone: str) -> None:
+        """One bone, or the mean of all."""
+        self._drawn = self._data(bone)
+        self._handle.scales = {
+            "x": viser.uplot.Scale(time=False),
+            "y": viser.uplot.Scale(range=(0.0, self._top())),
+        }
+        self._handle.data = self._with_now(max(self._now, 0))
+
+    def mark(self, time_s: float) -> None:
+        """The present."""
+        now = min(int(np.searchsorted(self._time_s, time_s)), len(self._time_s) - 1)
+        if now != self._now:
+            self._now = now
+            self._handle.data = self._with_now(now)
+
+    def _data(self, bone: str) -> list[Float[np.ndarray, " n"]]:
+        lines = []
+        for values in self._curve.by_person.values():
+            if bone == ALL_BONES:
+                there = np.isfinite(values[self._rows])
+                total = np.where(there, values[self._rows], 0.0).sum(axis=1)
+                count = there.sum(axis=1)
+                lines.append(np.where(count > 0, total / np.maximum(count, 1), np.nan))
+            else:
+                lines.append(values[self._rows, self._bone_names.index(bone)])
+        return lines
+
+    def _top(self) -> float:
+        if self._curve.top is not None:
+            return self._curve.top
+        values = np.concatenate([*self._drawn, [0.0]])
+        return float(1.05 * np.nanmax(values)) or 1.0
+
+    def _with_now(self, row: int) -> tuple[Float[np.ndarray, " n"], ...]:
+        """The present as a line from one point to the next, which is less than a pixel away."""
+        line = np.full(len(self._time_s), np.nan)
+        line[row] = 0.0
+        line[row - 1 if row == len(line) - 1 else row + 1] = self._top()
+        return (self._time_s, *self._drawn, line)

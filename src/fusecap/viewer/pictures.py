@@ -1,0 +1,156 @@
+"""Small live pictures: what a camera saw, what was detected in it, and who was solved there.
+
+A picture waits until its own instant has been solved, so that all three belong together. Cameras
+that deliver keypoints alone are drawn on grey.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from fusecap.body.landmarks import LandmarkSet
+from fusecap.geometry.camera import Camera, Rig
+from fusecap.online.step import LiveStep
+from fusecap.sinks.overlay import LINKS
+from fusecap.types import CameraImage, CameraSample
+from fusecap.viewer.figure import Pose, pose_of
+from fusecap.viewer.palette import Rgb
+
+WIDTH_PX = 320
+RATE_HZ = 5.0
+_DETECTED_RGB = (255, 255, 255)
+_DRAWN_FROM = 0.1
+"""Confidence below which a keypoint is not drawn."""
+_EMPTY_GREY = 70
+
+Picture = UInt8[np.ndarray, "h w 3"]
+
+
+class Pictures:
+    """The newest of each camera; `offer` and `sample` come from other threads than `ready`."""
+
+    def __init__(self, rig: Rig, landmarks: LandmarkSet) -> None:
+        self._rig = rig
+        links = [(landmarks.index(a), landmarks.index(b)) for a, b in LINKS]
+        self._links = [(a, b) for a, b in links if a is not None and b is not None]
+        self._waiting: list[CameraImage | None] = [None] * len(rig)
+        self._samples: list[CameraSample | None] = [None] * len(rig)
+        self._shown_ns = [-(1 << 62)] * len(rig)
+        self.drawn: list[Picture] = [_empty(camera) for camera in rig.cameras]
+        """RGB, 320 px wide."""
+
+    def offer(self, image: CameraImage) -> None:
+        """Kept where it is time for another one and none is waiting."""
+        if self._waiting[image.camera] is None and self._due(image.camera, image.timestamp_ns):
+            self._waiting[image.camera] = image
+
+    def sample(self, sample: CameraSample) -> None:
+        """What was found in the waiting picture; without pictures it waits like one."""
+        image = self._waiting[sample.camera]
+        if image is None:
+            free = self._samples[sample.camera] is None
+            wanted = free and self._due(sample.camera, sample.timestamp_ns)
+        else:
+            wanted = image.timestamp_ns == sample.timestamp_ns
+        if wanted:
+            self._samples[sample.camera] = sample
+
+    def ready(self, step: LiveStep, colours: Mapping[str, Rgb]) -> list[int]:
+        """Draws what the step's instant has reached; which cameras have a new picture."""
+        new = []
+        for row in range(len(self._rig)):
+            image, sample = self._waiting[row], self._samples[row]
+            exposed = image or sample
+            if exposed is None or exposed.timestamp_ns > step.timestamp_ns:
+                continue
+            self._shown_ns[row] = exposed.timestamp_ns
+            belongs = sample is not None and sample.timestamp_ns == exposed.timestamp_ns
+            poses = {name: pose_of(one) for name, one in step.people.items() if one is not None}
+            self.draw(row, image, sample.people if sample and belongs else None, poses, colours)
+            self._waiting[row] = self._samples[row] = None
+            new.append(row)
+        return new
+
+    def draw(
+        self,
+        row: int,
+        image: CameraImage | None,
+        found: Float[np.ndarray, "n k 3"] | None,
+        poses: Mapping[str, Pose],
+        colours: Mapping[str, Rgb],
+    ) -> None:
+        """One camera's picture anew."""
+        camera = self._rig.cameras[row]
+        picture = _empty(camera) if image is None else _small(image)
+        if found is not None:
+            self._draw_found(picture, found * [_shrink(camera), _shrink(camera), 1.0])
+        for name, pose in poses.items():
+            _draw_solved(picture, camera, pose, colours[name])
+        self.drawn[row] = picture
+
+    def _due(self, camera: int, timestamp_ns: int) -> bool:
+        return timestamp_ns - self._shown_ns[camera] >= 1e9 / RATE_HZ
+
+    def _draw_found(self, picture: Picture, people: Float[np.ndarray, "n k 3"]) -> None:
+        for person in people:
+            seen = person[:, 2] >= _DRAWN_FROM
+            for a, b in self._links:
+                if seen[a] and seen[b]:
+                    _line(picture, person[a], person[b], _DETECTED_RGB, 1)
+
+
+def mosaic(pictures: Sequence[Picture], names: Sequence[str]) -> Picture:
+    """Two in a row, each with its name."""
+    columns = min(2, len(pictures))
+    height = max(len(picture) for picture in pictures)
+    rows = -(-len(pictures) // columns)
+    whole = np.full((rows * height, columns * WIDTH_PX, 3), 255, dtype=np.uint8)
+    for place, (picture, name) in enumerate(zip(pictures, names, strict=True)):
+        top, left = place // columns * height, place % columns * WIDTH_PX
+        whole[top : top + len(picture), left : left + WIDTH_PX] = picture
+        for colour, width in (((0, 0, 0), 3), ((255, 255, 255), 1)):
+            cv2.putText(
+                whole,
+                name.encode("ascii", "replace").decode(),
+                (left + 6, top + 18),
+                cv2.FONT_HERSHEY_SIMPLEX,
+                0.5,
+                colour,
+                width,
+                cv2.LINE_AA,
+            )
+    return whole
+
+
+def _shrink(camera: Camera) -> float:
+    return WIDTH_PX / camera.size_px[0]
+
+
+def _empty(camera: Camera) -> Picture:
+    height = max(round(camera.size_px[1] * _shrink(camera)), 1)
+    return np.full((height, WIDTH_PX, 3), _EMPTY_GREY, dtype=np.uint8)
+
+
+def _small(image: CameraImage) -> Picture:
+    height, width = image.image.shape[:2]
+    size = WIDTH_PX, max(round(height * WIDTH_PX / width), 1)
+    small = cv2.resize(image.image, size, interpolation=cv2.INTER_AREA)
+    return cv2.cvtColor(small, cv2.COLOR_BGR2RGB)
+
+
+def _draw_solved(picture: Picture, camera: Camera, pose: Pose, colour: Rgb) -> None:
+    pixels = camera.project(pose.position_m) * _shrink(camera)
+    for bone, parent in enumerate(pose.shape.skeleton.parents):
+        if parent >= 0 and np.isfinite(pixels[[bone, parent]]).all():
+            _line(picture, pixels[parent], pixels[bone], colour, 2)
+
+
+def _line(picture: Picture, start: np.ndarray, end: np.ndarray, colour: Rgb, width: int) -> None:
+    """Ends far outside, as of people beside a camera, are left out: they overflow OpenCV."""
+    if max(np.abs(start[:2]).max(), np.abs(end[:2]).max()) < 8 * WIDTH_PX:
+        a, b = ((round(float(p[0])), round(float(p[1]))) for p in (start, end))
+        cv2.line(picture, a, b, colour, width, cv2.LINE_AA)

@@ -1,0 +1,143 @@
+"""A take on a page: people that move, a time line, curves."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Sequence
+
+import viser
+from viser import GuiEvent
+
+from fusecap.errors import TakeError
+from fusecap.geometry.camera import Rig
+from fusecap.sinks.take import Take
+from fusecap.viewer.controls import PlaybackControls
+from fusecap.viewer.curves import ALL_BONES, Curve, Plot, quality_curve
+from fusecap.viewer.figure import Pose
+from fusecap.viewer.page import Page
+from fusecap.viewer.palette import css, escaped, person_rgb
+from fusecap.viewer.people import People
+from fusecap.viewer.recording import RecordedDetections, RecordedViews
+from fusecap.viewer.room import Room, add_view_controls, places_of
+
+_UPDATES_HZ = 60.0
+_PLOTS_HZ = 8.0
+_IDLE_S = 0.25
+"""How often a page at rest looks whether it is to stop."""
+_SMALL = "margin:2px 14px;font-size:0.85em"
+
+
+class TakePage:
+    """Shows a take until it is stopped; raises `TakeError` for one without a frame."""
+
+    def __init__(
+        self,
+        page: Page,
+        take: Take,
+        *,
+        rig: Rig | None = None,
+        curves: Sequence[Curve] = (),
+        detections: RecordedDetections | None = None,
+    ) -> None:
+        if len(take.timestamps_ns) == 0:
+            raise TakeError("the take has no frame: nothing to view; solve it again")
+        self._page = page
+        self._take = take
+        rows = range(len(take.subject_names))
+        self._shapes = [take.shape(row) for row in rows]
+        self._rotations = [take.bone_rotation_in_world(row) for row in rows]
+        colours = {name: person_rgb(row) for row, name in enumerate(take.subject_names)}
+        room = Room(page, rig)
+        self._people = People(page.scene, take.skeleton, colours)
+        self._controls = PlaybackControls(page.gui, take.time_s)
+        with page.gui.add_folder("People"):
+            page.gui.add_html(_legend(take, list(colours.values())))
+            self._boxes = [
+                page.gui.add_checkbox(f"Show {name}", initial_value=True) for name in colours
+            ]
+            for box in self._boxes:
+                box.on_update(lambda _: self._controls.nudge())
+        everywhere = places_of(list(take.bone_position_in_world_m[:, :, 0]))
+        add_view_controls(page, room, lambda: everywhere)
+        self._views = detections and RecordedViews(page.gui, detections, colours)
+        self._plots = self._add_plots([quality_curve(take), *curves], colours)
+        self._drawn: tuple[int, tuple[bool, ...]] | None = None
+        self._draw(0, 0.0, plots=True)
+
+    def run(self, stopping: threading.Event) -> None:
+        """Plays until `stopping` is set; sends nothing while nobody looks."""
+        controls = self._controls
+        last_s = time.monotonic()
+        plotted_s = 0.0
+        while not stopping.is_set():
+            controls.wait(1 / _UPDATES_HZ if controls.playing else _IDLE_S)
+            now_s = time.monotonic()
+            frame, position_s = controls.advance(now_s - last_s)
+            last_s = now_s
+            if self._page.get_clients():
+                plots = not controls.playing or now_s - plotted_s > 1 / _PLOTS_HZ
+                plotted_s = now_s if plots else plotted_s
+                self._draw(frame, position_s, plots=plots)
+
+    def _draw(self, frame: int, position_s: float, *, plots: bool) -> None:
+        shown = tuple(box.value for box in self._boxes)
+        with self._page.atomic():
+            if (frame, shown) != self._drawn:
+                self._drawn = (frame, shown)
+                self._people.show(
+                    {
+                        name: self._pose(row, frame) if shown[row] else None
+                        for row, name in enumerate(self._take.subject_names)
+                    }
+                )
+            self._controls.show(position_s)
+            if plots:
+                for plot in self._plots:
+                    plot.mark(position_s)
+                if self._views is not None:
+                    self._views.show(int(self._take.timestamps_ns[frame]), self._poses(frame))
+
+    def _poses(self, frame: int) -> dict[str, Pose]:
+        poses = {n: self._pose(row, frame) for row, n in enumerate(self._take.subject_names)}
+        return {name: pose for name, pose in poses.items() if pose is not None}
+
+    def _pose(self, row: int, frame: int) -> Pose | None:
+        take = self._take
+        if not take.tracked[row, frame]:
+            return None
+        return Pose(
+            shape=self._shapes[row],
+            position_m=take.bone_position_in_world_m[row, frame],
+            rotation=self._rotations[row][frame],
+            quality=take.bone_quality[row, frame],
+        )
+
+    def _add_plots(
+        self, curves: Sequence[Curve], colours: dict[str, tuple[int, int, int]]
+    ) -> list[Plot]:
+        gui, take = self._page.gui, self._take
+        with gui.add_folder("Over time"):
+            bone = gui.add_dropdown("Bone", (ALL_BONES, *take.bone_names))
+            plots = [Plot(gui, curve, take.time_s, take.bone_names, colours) for curve in curves]
+
+        @bone.on_update
+        def _(event: GuiEvent[viser.GuiDropdownHandle[str]]) -> None:
+            for plot in plots:
+                plot.choose(event.target.value)
+
+        return plots
+
+
+def _legend(take: Take, colours: Sequence[tuple[int, int, int]]) -> str:
+    lines = []
+    for row, (name, colour) in enumerate(zip(take.subject_names, colours, strict=True)):
+        dot = f'<span style="color:{css(colour)};font-size:1.3em">&#9679;</span>'
+        about = (
+            f"{take.heights_m[row]:.2f} m tall, tracked in "
+            f"{100 * take.tracked[row].mean():.0f} % of frames"
+        )
+        lines.append(f'<div style="{_SMALL}">{dot} <b>{escaped(name)}</b>, {about}</div>')
+    what = "Simulated. " if take.provenance.get("simulated") else ""
+    note = f"{what}A person's right side is darker; bones that nothing measures are grey."
+    return "".join([*lines, f'<div style="{_SMALL};opacity:0.75">{note}</div>'])

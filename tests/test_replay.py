@@ -1,0 +1,241 @@
+"""A recorded run once more: the same poses, and better ones."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from fusecap.body.landmarks import LANDMARK_SETS
+from fusecap.cli import app
+from fusecap.doctor import diagnose_recording
+from fusecap.errors import InputError
+from fusecap.geometry.camera import Rig
+from fusecap.offline.replay import Replay, recorded_take, replay, solve_as_live
+from fusecap.offline.second_solve import solve_recording
+from fusecap.offline.solve import solve_session
+from fusecap.online.engine import Engine
+from fusecap.online.setup import LiveSetup
+from fusecap.sinks.take import load_take
+from fusecap.sources.recording import Recording
+from fusecap.sources.session import Session, load_session
+from fusecap.sources.session_data import open_session
+from fusecap.types import Command, CommandKind, ImuSample, Tick
+from live_events import same_bits
+from recorded_run import record, simulated_run
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("run")
+
+
+@pytest.fixture(scope="module")
+def run(folder):
+    return simulated_run(folder / "session")
+
+
+@pytest.fixture(scope="module")
+def recorded(run, folder) -> Path:
+    path = folder / "run.mcap"
+    with path.open("wb") as file:
+        record(file, *run)
+    return path
+
+
+def written(path: Path, setup, taken, **options) -> Recording:
+    with path.open("wb") as file:
+        record(file, setup, taken, **options)
+    return Recording(path)
+
+
+def test_replay_gives_the_very_steps_of_the_run(run, recorded):
+    again = list(replay(Recording(recorded)))
+    steps = [step for _, step in run[1] if step is not None]
+    assert len(again) == len(steps) > 50
+    assert all(same_bits(a, b) for a, b in zip(steps, again, strict=True))
+
+
+def test_replay_counts_poses_equal_to_those_recorded(run, recorded):
+    solved, again = solve_as_live(Recording(recorded))
+    sent = sum(
+        person is not None
+        for _, step in run[1]
+        if step is not None
+        for person in step.people.values()
+    )
+    assert again.equal == again.poses == sent
+    assert f"{sent} of {sent} poses are equal" in solved.report.notes[-1]
+    assert solved.take.provenance["simulated"] and solved.take.provenance["options"]["as_live"]
+
+
+def test_replay_notices_what_differs(run, tmp_path):
+    """A log without half of its sensor samples is replayed to other poses, and says so."""
+    setup, taken = run
+    fewer = [
+        (event, step)
+        for index, (event, step) in enumerate(taken)
+        if not (isinstance(event, ImuSample) and index % 2)
+    ]
+    again = Replay(written(tmp_path / "fewer.mcap", setup, fewer))
+    list(again.steps())
+    assert again.equal < again.poses
+
+
+def test_the_take_of_a_recording_holds_the_recorded_poses(run, recorded):
+    take = recorded_take(Recording(recorded))
+    live, _ = solve_as_live(Recording(recorded))
+    first = int(np.argmax(live.take.tracked.any(axis=0)))
+    assert take.subject_names[:2] == live.take.subject_names[:2]
+    assert np.array_equal(take.timestamps_ns, live.take.timestamps_ns[first:])
+    assert np.array_equal(take.theta, live.take.theta[:, first:], equal_nan=True)
+
+
+def test_second_solve_is_as_good_as_that_of_the_session(run, recorded, folder):
+    """The same samples, whatever order they came in, give the session's poses within 2 mm."""
+    again = solve_recording(Recording(recorded)).take
+    offline = solve_session(open_session(load_session(folder / "session"))).take
+    assert again.subject_names == offline.subject_names
+    assert again.tracked.all() and offline.tracked.all()
+    at = np.searchsorted(again.timestamps_ns, offline.timestamps_ns)
+    apart_m = np.linalg.norm(
+        again.bone_position_in_world_m[:, at] - offline.bone_position_in_world_m, axis=-1
+    )
+    assert apart_m.max() < 0.002
+
+
+def test_second_solve_takes_samples_that_came_too_late_for_the_run(run, tmp_path):
+    setup, taken = run
+    ticks = [item for item in taken if isinstance(item[0], Tick)]
+    samples = [item for item in taken if not isinstance(item[0], Tick)]
+    recording = written(tmp_path / "late.mcap", setup, [*ticks, *samples])
+    live, _ = solve_as_live(recording)
+    assert not live.take.tracked.any()
+    assert solve_recording(recording).take.tracked.mean() > 0.9
+
+
+def test_instants_that_the_run_left_out_are_solved(run, tmp_path):
+    setup, taken = run
+    ticks = [event for event, _ in taken if isinstance(event, Tick)]
+    left_out = {id(tick) for tick in ticks[20:30]}
+    recording = written(
+        tmp_path / "gaps.mcap", setup, [item for item in taken if id(item[0]) not in left_out]
+    )
+    take = solve_recording(recording).take
+    assert len(take.timestamps_ns) == len(ticks)
+    assert np.abs(np.diff(take.timestamps_ns) - 1e9 / 60).max() <= 1
+
+
+def test_a_recording_begun_in_mid_run_says_so_and_solves(run, tmp_path):
+    setup, taken = run
+    recording = written(tmp_path / "mid.mcap", setup, taken[len(taken) // 3 :], from_start=False)
+    solved = solve_recording(recording)
+    assert solved.take.tracked.any()
+    assert any("begun in mid-run" in note for note in solved.report.notes)
+    assert any("mid-run" in finding.found for finding in diagnose_recording(recording.path))
+
+
+def test_a_recording_without_instants_is_refused(run, tmp_path):
+    setup, taken = run
+    recording = written(
+        tmp_path / "none.mcap", setup, [item for item in taken if not isinstance(item[0], Tick)]
+    )
+    with pytest.raises(InputError, match="holds no solved instant"):
+        solve_recording(recording)
+    with pytest.raises(InputError, match="holds no pose"):
+        recorded_take(recording)
+
+
+def test_instants_years_apart_are_refused(run, tmp_path):
+    setup, taken = run
+    far = [(Tick(timestamp_ns=10**18), None)]
+    recording = written(tmp_path / "far.mcap", setup, [*taken, *far])
+    with pytest.raises(InputError, match="too many"):
+        solve_recording(recording)
+
+
+def test_commands_solve_and_check_a_recording(recorded, tmp_path):
+    runner = CliRunner()
+    out = tmp_path / "second.npz"
+    result = runner.invoke(app, ["solve", str(recorded), "--out", str(out), "--json"])
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["files"] == [str(out)] and load_take(out).tracked.any()
+    out = tmp_path / "live.npz"
+    command = ["solve", str(recorded), "--as-live", "--export", "bvh", "--out", str(out), "--json"]
+    result = runner.invoke(app, command)
+    report = json.loads(result.stdout)
+    assert report["replay"]["poses"] == report["replay"]["equal"] > 50
+    assert len(report["files"]) == 3
+    result = runner.invoke(app, ["doctor", str(recorded), "--json"])
+    findings = json.loads(result.stdout)["findings"]
+    assert result.exit_code == 0 and all(finding["severity"] != "error" for finding in findings)
+    assert any("60.0 per second" in finding["found"] for finding in findings)
+
+
+def test_doctor_tells_a_cut_recording(recorded, tmp_path):
+    path = tmp_path / "cut.mcap"
+    path.write_bytes(recorded.read_bytes()[:-20_000])
+    found = [f.found for f in diagnose_recording(path) if f.severity == "warning"]
+    assert any("was cut off" in text for text in found)
+
+
+def test_as_live_is_for_recordings(folder):
+    with pytest.raises(InputError, match="is no recording"):
+        CliRunner().invoke(
+            app, ["solve", str(folder / "session"), "--as-live"], catch_exceptions=False
+        )
+
+
+def test_second_solve_mounts_sensors_as_the_t_pose_of_the_run(tmp_path):
+    """Sensors without a mounting are of use to the run after its T-pose, here from the start."""
+    session = Session.model_validate(
+        {
+            "session": {"name": "sensors", "rate_hz": 60.0},
+            "subject": [
+                {"name": "anna", "imu": [{"bone": b, "live": "lsl:x"} for b in ("hips", "head")]}
+            ],
+        },
+        context={"file": tmp_path / "session.toml"},
+    )
+    setup = LiveSetup(session=session, rig=Rig(cameras=()), landmarks=LANDMARK_SETS["body25"])
+    taken = []
+    engine = Engine(setup)
+    for index in range(240):
+        now_ns = round(index * 1e9 / 60)
+        events = [
+            ImuSample(
+                subject="anna",
+                bone=bone,
+                timestamp_ns=now_ns,
+                orientation_wxyz=np.array([np.cos(turn), 0, np.sin(turn), 0]),
+                accel_m_s2=np.array([0, 9.80665, 0]),
+            )
+            for bone, turn in (("hips", 0.3), ("head", 0.5))
+        ]
+        events += [Command(kind=CommandKind.TPOSE)] if index == 120 else []
+        taken += [(event, engine.take(event)) for event in (*events, Tick(timestamp_ns=now_ns))]
+    recording = written(tmp_path / "sensors.mcap", setup, taken)
+    live, again = solve_as_live(recording)
+    assert again.equal == again.poses > 60
+    assert not live.take.tracked[0, :120].any() and live.take.tracked[0, -1]
+    second = solve_recording(recording).take
+    assert second.tracked.all()
+    assert second.theta[0, -1] == pytest.approx(live.take.theta[0, -1], abs=1e-3)
+
+
+def test_second_solve_expects_who_was_added_in_the_run(run, tmp_path):
+    setup, taken = run
+    settings = setup.session.settings.model_copy(update={"max_subjects": 1})
+    one = setup.session.model_copy(
+        update={"settings": settings, "subjects": setup.session.subjects[:1]}
+    )
+    events = [(event, None) for event, _ in taken if getattr(event, "subject", "") in ("", "anna")]
+    events.insert(len(events) // 2, (Command(kind=CommandKind.ADD_SUBJECT, subject="ben"), None))
+    recording = written(tmp_path / "added.mcap", replace(setup, session=one), events)
+    take = solve_recording(recording).take
+    assert take.subject_names == ("anna", "ben")
+    assert take.tracked.mean(axis=1).min() > 0.9
