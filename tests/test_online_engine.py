@@ -33,7 +33,7 @@ from live_scene import (
 )
 
 ALL = (0, 1, 2, 3)
-FAST = {"root_m_s": 16.0, "bone_rad_s": 53.0, "joint_m_s": 45.0}
+FAST = {"root_m_s": 16.0, "bone_rad_s": 53.0, "joint_m_s": 30.0}
 """Between two instants: the limits of `fusecap.online.continuity` with their noise, at 60 Hz."""
 
 

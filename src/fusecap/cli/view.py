@@ -113,13 +113,13 @@ def look(
     from fusecap.viewer.take import TakePage
 
     page = Page(title, host=host, port=port)
-    try:
-        shown = TakePage(page, take, rig=rig, curves=curves, detections=detections)
-        _announce(page, browser=browser, as_json=as_json)
-        with suppress(KeyboardInterrupt):
+    with suppress(KeyboardInterrupt):
+        try:
+            shown = TakePage(page, take, rig=rig, curves=curves, detections=detections)
+            _announce(page, browser=browser, as_json=as_json)
             shown.run(threading.Event())
-    finally:
-        page.stop()
+        finally:
+            page.stop()
 
 
 def _recorded(path: Path) -> tuple[Take, RecordedDetections | None]:
