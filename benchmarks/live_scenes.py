@@ -112,7 +112,9 @@ def round_trip(video: Path, folder: Path, rate_hz: float = 30.0) -> Path:
 def networks(threads: int) -> Detector:
     """The small pose network and the person detector."""
     return build_detector(
-        DetectorOptions(model=str(POSE_MODEL), person_model=str(PERSON_MODEL)), threads=threads
+        DetectorOptions(model=str(POSE_MODEL), person_model=str(PERSON_MODEL)),
+        threads=threads,
+        follow_others=False,
     )
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import socket
-import threading
 
 import numpy as np
 import pytest
@@ -13,11 +12,12 @@ from websockets.sync.client import connect
 
 from fusecap.errors import InputError
 from fusecap.live.latency import LatencyBook
-from fusecap.live.outputs import QUEUE, StreamOutput, first_cast
+from fusecap.live.outputs import StreamOutput, first_cast
 from fusecap.live.source import SessionClock
 from fusecap.live.streams import VmcStream, open_stream
 from fusecap.live.target import Target, parse_target
 from fusecap.live.transports import Counts
+from fusecap.sinks.streams.person_pose import pose_of_estimate
 from fusecap.types import Estimate
 from live_fakes import estimate_of, live_setup, step_of, wait_for
 from motions import person
@@ -26,18 +26,15 @@ from scenes import ring
 HOST = "127.0.0.1"
 
 
-class HeldStream:
-    """Sends only when it is let."""
+class KeepingStream:
+    """Keeps what is sent."""
 
     def __init__(self) -> None:
         self.target, self.counts = Target(protocol="osc", host=HOST, port=9), Counts()
-        self.free, self.sending = threading.Event(), threading.Event()
         self.frames, self.casts = [], []
         self.closed = False
 
     def send(self, frame) -> None:
-        self.sending.set()
-        assert self.free.wait(10)
         self.frames.append(frame)
 
     def set_cast(self, cast) -> None:
@@ -67,34 +64,13 @@ def step_with(number: int, *people: Estimate):
     return step_of(number, people or [estimate_of(number)])
 
 
-def test_a_stream_that_stalls_keeps_the_newest_instants_and_nobody_waits():
-    stream = HeldStream()
-    output = output_to(stream)
-    output.on_step(step_with(0), 0)
-    assert stream.sending.wait(10)
-    for number in range(1, 50):
-        output.on_step(step_with(number), 0)
-    stream.free.set()
-    wait_for(lambda: len(stream.frames) == 1 + QUEUE)
-    output.close()
-    assert [frame.timestamp_ns for frame in stream.frames] == [0, 47, 48, 49]
-    assert output.stream_status().dropped == 49 - QUEUE
-    assert stream.closed
-
-
-def test_what_waits_is_sent_before_the_end():
-    stream = HeldStream()
-    output = output_to(stream)
-    for number in range(QUEUE):
-        output.on_step(step_with(number), 0)
-    stream.free.set()
-    output.close()
-    assert len(stream.frames) == QUEUE
-    assert output.poses == QUEUE
+def send(output, step, now_ns) -> None:
+    poses = {name: each and pose_of_estimate(each) for name, each in step.people.items()}
+    output.send(poses, step.timestamp_ns, now_ns)
 
 
 def test_a_stream_that_raises_says_so_and_goes_on():
-    class Failing(HeldStream):
+    class Failing(KeepingStream):
         def send(self, frame):
             self.frames.append(frame)
             if len(self.frames) == 1:
@@ -102,22 +78,21 @@ def test_a_stream_that_raises_says_so_and_goes_on():
 
     stream = Failing()
     output = output_to(stream)
-    output.on_step(step_with(0), 0)
+    send(output, step_with(0), 0)
     wait_for(lambda: stream.counts.failed)
     assert output.stream_status().remark == "ValueError: no such packet"
-    output.on_step(step_with(1), 0)
+    send(output, step_with(1), 0)
     wait_for(lambda: output.poses == 1)
     assert output.stream_status().remark == ""
     output.close()
 
 
 def test_latency_is_that_of_the_packet():
-    clock, book, stream = SessionClock(), LatencyBook(), HeldStream()
-    stream.free.set()
+    clock, book, stream = SessionClock(), LatencyBook(), KeepingStream()
     output = StreamOutput(lambda cast: stream, {}, clock, book)
     now_ns = clock.now_ns()
     book.solved(now_ns - 50_000_000, now_ns - 20_000_000)
-    output.on_step(step_with(now_ns - 50_000_000), now_ns)
+    send(output, step_with(now_ns - 50_000_000), now_ns)
     output.close()
     stages = {stage.stage: stage for stage in book.total()}
     assert stages["exposure to packet"].p50_ms >= 48
@@ -126,15 +101,14 @@ def test_latency_is_that_of_the_packet():
 
 
 def test_the_cast_begins_with_the_session_and_follows_who_comes_and_goes():
-    stream = HeldStream()
-    stream.free.set()
+    stream = KeepingStream()
     setup = live_setup(ring(0))
     cast = first_cast(setup)
     assert list(cast) == ["anna"]
     output = output_to(stream, cast)
-    output.on_step(step_with(0, estimate_of(0)), 0)
-    output.on_step(step_with(1, estimate_of(1), estimate_of(1, "guest")), 0)
-    output.on_step(step_with(2, estimate_of(2, "guest")), 0)
+    send(output, step_with(0, estimate_of(0)), 0)
+    send(output, step_with(1, estimate_of(1), estimate_of(1, "guest")), 0)
+    send(output, step_with(2, estimate_of(2, "guest")), 0)
     output.close()
     assert [list(cast) for cast in stream.casts] == [["anna", "guest"], ["guest"]]
     assert [list(frame.people) for frame in stream.frames] == [
@@ -151,12 +125,11 @@ def test_a_body_that_is_measured_is_told_once_a_second_at_most():
         def now_ns(self):
             return self.now
 
-    clock, stream = Clock(), HeldStream()
-    stream.free.set()
+    clock, stream = Clock(), KeepingStream()
     output = StreamOutput(lambda cast: stream, {"anna": person()}, clock, LatencyBook())
     for number in range(4):
         clock.now = number * 600_000_000
-        output.on_step(step_with(number, estimate_of(number, shape=person(1.6 + 0.01 * number))), 0)
+        send(output, step_with(number, estimate_of(number, shape=person(1.6 + 0.01 * number))), 0)
         wait_for(lambda number=number: output.poses == number + 1)
     output.close()
     assert [cast["anna"].height_m for cast in stream.casts] == pytest.approx([1.62])
@@ -179,9 +152,9 @@ def test_vmc_without_room_for_someone_says_so_and_serves_the_others():
     with pytest.raises(InputError, match="2 people need ports up to 65540"):
         stream.set_cast({"anna": person(), "ben": person()})
     output = StreamOutput(lambda cast: stream, {"anna": person()}, SessionClock(), LatencyBook())
-    output.on_step(step_with(0, estimate_of(0), estimate_of(0, "ben")), 0)
+    send(output, step_with(0, estimate_of(0), estimate_of(0, "ben")), 0)
     wait_for(lambda: output.stream_status().remark)
-    output.on_step(step_with(1, estimate_of(1), estimate_of(1, "ben")), 0)
+    send(output, step_with(1, estimate_of(1), estimate_of(1, "ben")), 0)
     wait_for(lambda: stream.counts.sent + stream.counts.refused > 1)
     output.close()
 
@@ -197,7 +170,7 @@ def test_clients_of_the_websocket_hear_of_a_new_person():
     with connect(str(target), compression=None) as client:
         assert [p["name"] for p in json.loads(client.recv(10))["people"]] == ["anna"]
         wait_for(lambda: not output.stream_status().remark)
-        output.on_step(step_with(1, estimate_of(1), estimate_of(1, "guest")), 0)
+        send(output, step_with(1, estimate_of(1), estimate_of(1, "guest")), 0)
         message = json.loads(client.recv(10))
         assert message["type"] == "cast"
         assert [p["name"] for p in message["people"]] == ["anna", "guest"]
@@ -238,7 +211,7 @@ def test_a_websocket_client_that_never_reads_and_a_port_without_a_listener_hold_
             number += 1
             assert number < 20_000, "the system's buffers take more than any client has"
             for output in outputs:
-                output.on_step(step_with(number), 0)
+                send(output, step_with(number), 0)
             wait_for(lambda number=number: outputs[2].poses == number + 1)
             first = well.recv(65536)
             well.recv(65536)

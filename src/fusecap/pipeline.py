@@ -61,6 +61,11 @@ class Cast(Protocol):
         """Follow a subject no longer."""
         ...
 
+    @property
+    def is_full(self) -> bool:
+        """Everyone there is a place for is being followed."""
+        ...
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Step:
@@ -185,6 +190,11 @@ class Pipeline:
             self._cast(self._sorter).remove_subject(name)
         self._estimators.pop(name, None)
         self._removed.add(name)
+
+    @property
+    def is_full(self) -> bool:
+        """Everyone there is a place for is being followed; others are bystanders."""
+        return isinstance(self._sorter, Cast) and self._sorter.is_full
 
     @staticmethod
     def _cast(sorter: Sorter) -> Cast:

@@ -227,6 +227,11 @@ class Tracker:
             if self._max_subjects < sys.maxsize:
                 self._max_subjects -= 1
 
+    @property
+    def is_full(self) -> bool:
+        """Every place is taken by somebody who is being followed."""
+        return sum(place.live for place in self._places) >= self._max_subjects
+
     # ------------------------------------------------------------------ match, check, second round
 
     def _match(

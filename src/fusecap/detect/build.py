@@ -26,10 +26,12 @@ def build_detector(
     *,
     landmarks: LandmarkSet | None = None,
     threads: int | None = None,
+    follow_others: bool = True,
 ) -> Detector:
     """Fetch the networks where needed, load them and put them together.
 
     `landmarks` says what the keypoints are where their number does not; `threads` None: all cores.
+    `follow_others` is `TopDownDetector`'s.
     Raises `InputError` where a network is unknown, cannot be fetched or loaded, or does not fit.
     """
     if options.person_every < 1:
@@ -41,7 +43,7 @@ def build_detector(
     pose = PoseNetwork(network, landmarks)
     person = PersonDetector(_load(options.person_model, options.runtime, progress, threads))
     finder = PackedPersonDetector(person) if options.packed else person
-    return TopDownDetector(finder, pose, options.person_every)
+    return TopDownDetector(finder, pose, options.person_every, follow_others=follow_others)
 
 
 def _load(model: str, runtime: str, progress: Progress | None, threads: int | None) -> Network:

@@ -3,12 +3,13 @@
 Running the person detector on every view is what costs most, and it is hardly ever needed: where
 people are is known from where they were. So boxes come from the keypoints expected in each view
 (projected from predicted skeletons, and those of the instant before), and the person detector runs
-every `person_every` instants, and at once in a view where someone expected was not found. Where it
+every `person_every` instants, and soon in a view where someone expected was not found. Where it
 then finds nobody new either, as with people behind a wall, the view's next extra run waits 2, 4,
 ... instants, at most `person_every`.
 
 All views are searched at the first instant, then in turn, so that instants take about equally long:
-of four views with `person_every` 10 one 3 instants later, the others 5, 8 and 10.
+of four views with `person_every` 10 one 3 instants later, the others 5, 8 and 10. Extra runs are
+one per instant, and only where no view has its turn.
 
 All crops of all views of an instant go through the pose network as one batch. A crop of one of two
 people who overlap may show both, and the network then may answer with the other one: of sets of
@@ -17,6 +18,7 @@ keypoints that are alike (`fusecap.detect.people.similarity`) only the most conf
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
 
@@ -42,6 +44,8 @@ more both are tried, for a box found about two people must not replace those of 
 _LEAST_BOX_PX = 8.0
 _PART_IN_VIEW = 0.3
 """Of an expected person's box: less of it in the image, and nobody misses them."""
+_ELSEWHERE = 0.1
+"""Overlap of boxes below which they are not about one person, however fast it moved."""
 _SAME_EXPECTED = 0.5
 """Similarity of an expected person to the one of the instant before, when they are one."""
 
@@ -88,10 +92,23 @@ class KeypointFinder(Protocol):
 class TopDownDetector:
     """Person detector now and then, pose network always."""
 
-    def __init__(self, person: PersonFinder, pose: KeypointFinder, person_every: int = 10) -> None:
+    def __init__(
+        self,
+        person: PersonFinder,
+        pose: KeypointFinder,
+        person_every: int = 10,
+        *,
+        follow_others: bool = True,
+    ) -> None:
+        """Bystanders cost little without `follow_others`.
+
+        As soon as somebody is predicted in some view, whom nobody predicts is then looked at only
+        when the person detector runs.
+        """
         self._person = person
         self._pose = pose
         self._person_every = person_every
+        self._follow_others = follow_others
         self.reset()
 
     @property
@@ -127,8 +144,9 @@ class TopDownDetector:
             self._turn = [-1] * len(images)
         present = [i for i, image in enumerate(images) if image is not None]
         shown = [image for image in images if image is not None]
+        others = self._follow_others or not any(len(those) for those in predicted)
         expected = [
-            _expected(_known(predicted[i], self._last[i]), image)
+            _expected(_known(predicted[i], self._last[i], others=others), image)
             for i, image in zip(present, shown, strict=True)
         ]
         boxes = [expected_boxes for expected_boxes, _ in expected]
@@ -138,13 +156,14 @@ class TopDownDetector:
         for row, found_boxes in zip(due, found, strict=True):
             boxes[row] = _refreshed(boxes[row], found_boxes[:, :4])
         people = self._poses(shown, boxes)
-        missing = [
+        missing = (
             row
             for row, (i, (_, count)) in enumerate(zip(present, expected, strict=True))
             if row not in due and len(people[row]) < count and self._may_search(i)
-        ]
-        if missing:
-            self._search_again(missing, present, shown, people)
+        )
+        again = list(itertools.islice(missing, 0 if due else 1))
+        if again:
+            self._search_again(again, present, shown, people)
         result = [self._nobody()] * len(images)
         for i, those in zip(present, people, strict=True):
             result[i] = those
@@ -200,16 +219,18 @@ class TopDownDetector:
 
 
 def _known(
-    predicted: Float[np.ndarray, "m k 3"], last: Float[np.ndarray, "n k 3"]
+    predicted: Float[np.ndarray, "m k 3"], last: Float[np.ndarray, "n k 3"], *, others: bool
 ) -> Float[np.ndarray, "p k 3"]:
-    """The predicted people, and those of the instant before whom nobody predicted."""
+    """The predicted people, and those of the instant before whom nobody predicted.
+
+    Without `others` only those of them who may be a predicted one after all.
+    """
     if not len(predicted) or not len(last):
-        return predicted if len(predicted) else last
-    known = similarity(last, predicted).max(axis=1) > _SAME_EXPECTED
-    known |= (
-        overlaps(np.nan_to_num(bounds(last)), np.nan_to_num(bounds(predicted))).max(axis=1)
-        > SAME_BOX
-    )
+        return last if others and not len(predicted) else predicted
+    overlap = overlaps(np.nan_to_num(bounds(last)), np.nan_to_num(bounds(predicted))).max(axis=1)
+    known = (similarity(last, predicted).max(axis=1) > _SAME_EXPECTED) | (overlap > SAME_BOX)
+    if not others:
+        known |= overlap < _ELSEWHERE
     return np.concatenate([predicted, last[~known]])
 
 

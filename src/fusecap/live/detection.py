@@ -54,6 +54,8 @@ class DetectionLoop:
         self._latency = latency
         self._incidents = incidents
         self._expected: Sequence[np.ndarray] = self._nobody(cameras)
+        self._curious = True
+        """It has not been told where to look since it last looked."""
         self._slots: list[tuple[CameraImage, int] | None] = [None] * cameras
         self._last_ns = [-_ALIVE_NS] * cameras
         self._changed = threading.Condition()
@@ -86,9 +88,14 @@ class DetectionLoop:
             self._last_ns[image.camera] = now_ns
             self._changed.notify()
 
-    def expect(self, people: Sequence[np.ndarray]) -> None:
-        """Where people are expected from now on, per camera (m, k, 3)."""
-        self._expected = people
+    def expect(self, people: Callable[[], Sequence[np.ndarray]]) -> None:
+        """Where people are expected from now on, per camera (m, k, 3).
+
+        `people` is called only where the detector has used what it was told before.
+        """
+        if self._curious:
+            self._curious = False
+            self._expected = people()
 
     @property
     def idle(self) -> bool:
@@ -135,7 +142,8 @@ class DetectionLoop:
             images[image.camera] = image.image
             self._latency.add(WAIT_FOR_DETECTOR, start_ns - arrival_ns)
             self._show(image)
-        found = self._detector.detect(images, self._expected)
+        expected, self._curious = self._expected, True
+        found = self._detector.detect(images, expected)
         end_ns = self._clock.now_ns()
         self._latency.add(DETECTION, end_ns - start_ns)
         self.rounds.add(end_ns)

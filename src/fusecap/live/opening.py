@@ -32,7 +32,9 @@ def open_setup(
     if not pictures:
         return setup_of(session), None
     threads = max(1, (os.cpu_count() or 1) - 1)
-    detector = build_detector(detector_options(session), progress, threads=threads)
+    detector = build_detector(
+        detector_options(session), progress, threads=threads, follow_others=False
+    )
     landmarks = detector.landmarks
     for camera in session.cameras:
         if camera not in pictures and camera.landmark_set_name != landmarks.name:

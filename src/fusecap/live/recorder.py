@@ -41,6 +41,8 @@ WARN_MINUTES = 5.0
 """Left on the disk, at the rate so far."""
 JPEG_QUALITY = 80
 _POLL_S = 0.05
+_PACKETS_FIRST_S = 0.004
+"""After an instant: its packets leave before it is written."""
 _BATCH = 200
 """Items between two looks at the time."""
 _ITEM_BYTES = 500
@@ -74,6 +76,7 @@ class Recorder:
         self._queued_bytes = 0
         self._lock = threading.Lock()
         self._closing = threading.Event()
+        self._solved = threading.Event()
         self._begun_s = self._ended_s = time.monotonic()
         self._bytes = 0
         self._file = (open_file or _new_file)(self.path)
@@ -102,6 +105,7 @@ class Recorder:
         if people:
             size = sum(5 * one.bone_rotation_in_world.nbytes for one in people)
             self._put(lambda: self._writer.poses(people, now_ns), size)
+        self._solved.set()
 
     def on_image(self, image: CameraImage) -> None:
         if not self._images:
@@ -149,7 +153,7 @@ class Recorder:
         flushed_s = synced_s = looked_s = time.monotonic()
         try:
             while not self._problem:
-                closing = self._closing.wait(0.0 if self._queue else _POLL_S)
+                closing = self._wait()
                 self._write_some()
                 now_s = time.monotonic()
                 if now_s - flushed_s >= FLUSH_S:
@@ -175,6 +179,13 @@ class Recorder:
             self._queue.clear()
             with suppress(OSError):
                 self._file.close()
+
+    def _wait(self) -> bool:
+        """Until shortly after an instant, when the solver has time; whether to close."""
+        if not self._closing.is_set() and self._solved.wait(_POLL_S):
+            self._solved.clear()
+            self._closing.wait(_PACKETS_FIRST_S)
+        return self._closing.is_set()
 
     def _write_some(self) -> None:
         for _ in range(min(len(self._queue), _BATCH)):

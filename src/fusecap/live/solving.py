@@ -87,7 +87,7 @@ class Solving:
         latency: LatencyBook,
         on_event: Callable[[Event, int], None],
         on_step: Callable[[LiveStep, int], None],
-        expect: Callable[[Sequence[np.ndarray]], None] | None,
+        expect: Callable[[Callable[[], Sequence[np.ndarray]]], None] | None,
         failed: Callable[[Exception], None],
     ) -> None:
         """`expect` takes where people are expected, for a detector.
@@ -194,7 +194,7 @@ class Solving:
             self._latency.add(LAST_SAMPLE_TO_SOLVE, start_ns - last_arrival_ns)
         self._tally(step, both_sides, end_ns)
         if self._expect is not None:
-            self._expect(self._engine.expected(self._clock.now_ns()))
+            self._expect(lambda: self._engine.expected(self._clock.now_ns()))
 
     def _engine_takes(self, event: Event) -> LiveStep | None:
         try:

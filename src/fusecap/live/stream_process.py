@@ -2,7 +2,7 @@
 
 Python computes on one thread at a time: what four streams encode, a few milliseconds per instant,
 would come out of the time between a sample and its pose. So the solver's thread only packs an
-instant's poses; a thread passes them on to a child, where each stream is a `StreamOutput` as ever.
+instant's poses; a thread passes them on to a child, which sends them to one stream after the other.
 The child tells four times a second what it has sent and when; both processes read one clock.
 
     python -m fusecap.live.stream_process        the child; pickles on stdin and stdout
@@ -20,7 +20,7 @@ from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import partial
-from typing import IO, Any
+from typing import IO
 
 from fusecap.errors import InputError
 from fusecap.live.latency import LatencyBook
@@ -30,8 +30,8 @@ from fusecap.live.status import LiveStatus, StreamStatus
 from fusecap.live.streams import Cast, open_stream
 from fusecap.live.target import Target
 from fusecap.online.step import LiveStep
-from fusecap.pipeline import Step
-from fusecap.types import CameraImage, Detections, Event
+from fusecap.sinks.streams.person_pose import pose_of_estimate
+from fusecap.types import CameraImage, Event
 
 QUEUE = 3
 """Instants that the child may lie behind before the oldest is lost."""
@@ -245,23 +245,14 @@ def _child(source: IO[bytes], sink: IO[bytes]) -> None:
     reporting.start()
     with suppress(EOFError):  # the parent is gone
         while (instant := pickle.load(source)) is not None:
-            step = _bare_step(*instant)
+            timestamp_ns, people, handed_ns = instant
+            poses = {name: each and pose_of_estimate(each) for name, each in people.items()}
             for output in outputs:
-                output.on_step(step, instant[2])
+                output.send(poses, timestamp_ns, handed_ns)
     _close(outputs)
     ended.set()
     reporting.join()
     _tell(sink, None)
-
-
-def _bare_step(timestamp_ns: int, people: dict[str, Any], now_ns: int) -> LiveStep:
-    return LiveStep(
-        timestamp_ns=timestamp_ns,
-        detections=Detections(timestamp_ns=timestamp_ns, people=()),
-        readings={},
-        step=Step(updates=(), estimates=()),
-        people=people,
-    )
 
 
 def _close(outputs: Sequence[StreamOutput]) -> None:

@@ -2,7 +2,7 @@
 
 Everyone the pipeline follows is predicted to the instant in the world and projected into every
 view, also into those that had lost them. Detections that belong to nobody it follows (newcomers,
-bystanders, false ones) are expected where they were.
+bystanders, false ones) are expected where they were, unless there is no place for anybody else.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ def expected_people(
     expected = []
     for index, camera in enumerate(rig.cameras):
         taken = {u.person[index].item() for u in step.updates if u.track_id in followed}
-        free = [n for n in range(len(people[index])) if n not in taken]
+        others = range(0 if pipeline.is_full else len(people[index]))
+        free = [n for n in others if n not in taken]
         projected = [_projected(camera, point) for point in points]
         visible = [p[None] for p in projected if _is_in_view(camera, p)]
         expected.append(np.concatenate([*visible, people[index][free]]))

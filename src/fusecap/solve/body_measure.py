@@ -31,6 +31,8 @@ _STATURE = ("upper_arm", "forearm", "thigh", "shank", "trunk")
 _END_BONE = {"upper_arm": "forearm", "forearm": "hand", "thigh": "shank", "shank": "foot"}
 _PLAUSIBLE = (0.6, 1.5)
 """A sample outside these multiples of the reference person's length is a triangulation error."""
+MEASURE_SHARE = 25
+"""Between two measurements as many instants as there were so far, over this."""
 _SPINE = ("spine", "spine1", "spine2", "spine3", "neck")
 
 
@@ -45,6 +47,10 @@ class BodyMeasure:
     min_samples: int = 5
     """Per segment before its median is used."""
     _samples: dict[str, list[float]] = field(default_factory=dict)
+    _instants: int = 0
+    _due: int = 0
+    """The instant after which the body is measured again."""
+    _shape: BodyShape | None = None
 
     def __post_init__(self) -> None:
         shape = BodyShape.from_height(self.skeleton, 1.75)
@@ -72,6 +78,7 @@ class BodyMeasure:
 
     def add(self, points_in_world_m: Float[np.ndarray, "k 3"]) -> None:
         """One instant's triangulated landmarks; NaN where missing."""
+        self._instants += 1
         for name, reference in self._reference.items():
             kept = self._samples.setdefault(name, [])
             for a, b in self._pairs[name]:
@@ -81,7 +88,16 @@ class BodyMeasure:
             del kept[: -self.max_samples]
 
     def shape(self) -> BodyShape | None:
-        """The body measured so far; None until some segment has enough samples."""
+        """The body measured so far; None until some segment has enough samples.
+
+        Measured anew after 4 % more instants: medians of hundreds of samples hardly move in one.
+        """
+        if self._shape is None or self._instants >= self._due:
+            self._shape = self._measured()
+            self._due = self._instants + 1 + min(self._instants, self.max_samples) // MEASURE_SHARE
+        return self._shape
+
+    def _measured(self) -> BodyShape | None:
         lengths = {
             name: float(np.median(kept))
             for name, kept in self._samples.items()

@@ -215,7 +215,7 @@ class Estimator:
             return
         self._measure.add(points)
         shape = self._measure.shape()
-        if shape is not None:
+        if shape is not None and shape is not self.shape:
             self.solver.set_shape(shape)
 
     def _measurements(self, observation: Observation) -> Measurements:
