@@ -30,7 +30,17 @@ def session(tmp_path_factory) -> Path:
 
 @pytest.mark.parametrize(
     "command",
-    [(), ("demo",), ("solve",), ("export",), ("doctor",), ("calibrate",), ("calibrate", "prior")],
+    [
+        (),
+        ("demo",),
+        ("solve",),
+        ("export",),
+        ("doctor",),
+        ("live",),
+        ("view",),
+        ("calibrate",),
+        ("calibrate", "prior"),
+    ],
 )
 def test_help_shows_usage_and_an_example(command):
     result = fusecap(*command, "--help")

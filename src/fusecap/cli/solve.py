@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from fusecap.offline.solve import Solved, SolveReport
 
 EXAMPLE = (
-    "Examples: fusecap solve recordings/duo --export bvh --json > report.json  |  "
+    "Example: fusecap solve recordings/duo --export bvh; of a live run: "
     "fusecap solve recordings/duo/duo-2026-03-01-101500.mcap"
 )
 
