@@ -638,5 +638,5 @@ def test_session_without_live_keys_has_no_sources(tmp_path):
 def test_missing_harvesters_is_named_before_anything_starts(tmp_path):
     file = write_session(tmp_path)
     edit(file, 'keypoints = "keypoints/cam0"', 'live = "genicam:1"')
-    with pytest.raises(InputError, match="pip install harvesters"):
+    with pytest.raises(InputError, match="pip install"):
         device_sources(load_session(file), SessionClock())

@@ -1,7 +1,7 @@
 """Machine-vision cameras (GigE Vision, USB3 Vision, ...) through GenICam's own `harvesters`.
 
 Written from its documentation and tried against a stand-in only: no such camera has been at hand.
-Needs `pip install harvesters` and the maker's GenTL producer, a library whose folder is listed in
+Needs the extra `genicam` and the maker's GenTL producer, a library whose folder is listed in
 GENICAM_GENTL64_PATH, as its installer leaves it. Exposure, gain and trigger stay as the maker's
 tools have set them; size and rate are set where the address asks for them.
 """
@@ -34,7 +34,8 @@ def open_genicam(address: GenICam, clock: SessionClock) -> Callable[[], GenICamG
         core = importlib.import_module("harvesters.core")
     except ImportError:
         raise InputError(
-            'live = "genicam:..." needs harvesters; install it with: pip install harvesters'
+            "live = 'genicam:...' needs the extra 'genicam'; install it with: "
+            "pip install 'fusecap[genicam]'"
         ) from None
     return lambda: GenICamGrabber(address, clock, core)
 
