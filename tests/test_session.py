@@ -3,7 +3,7 @@ import pytest
 
 from fusecap.errors import InputError, SessionError
 from fusecap.sources.session import load_session, parse_session
-from fusecap.sources.session_data import open_session
+from fusecap.sources.session_data import open_keypoints, open_session
 from session_files import edit, imu_csv, write_session
 
 CAMERA = '[session]\nname = "a"\ncalibration = "c.toml"\n[[camera]]\nname = "left"\nkeypoints="k"\n'
@@ -236,3 +236,10 @@ def test_hash_follows_content_and_not_place(tmp_path):
     assert hashes[0] == hashes[1]
     edit(tmp_path / "b" / "calibration.toml", "700.0", "701.0")
     assert open_session(load_session(tmp_path / "b")).content_hash != hashes[0]
+
+
+def test_camera_that_is_live_only_cannot_be_solved(tmp_path):
+    text = '[session]\nname = "a"\n[[camera]]\nname = "left"\nlive = "webcam:0"\n'
+    (tmp_path / "session.toml").write_text(text)
+    with pytest.raises(SessionError, match="'left' is live only"):
+        open_keypoints(load_session(tmp_path))

@@ -209,6 +209,8 @@ class OpenCvGrabber:
         self._name = f"webcam {address.index}"
         self._clock = clock
         self._cv2 = cv2
+        # Whether the camera is there is said in fusecap's words.
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
         linux = sys.platform == "linux"
         self._capture = cv2.VideoCapture(address.index, cv2.CAP_V4L2 if linux else cv2.CAP_ANY)
         if not self._capture.isOpened():

@@ -273,6 +273,11 @@ def _keypoints(
     session: Session, index: int, landmarks: LandmarkSet | None, progress: Progress | None
 ) -> KeypointTrack:
     camera = session.cameras[index]
+    if camera.keypoints is None and camera.video is None:
+        raise SessionError(
+            f"{session.path}: camera '{camera.name}' is live only, nothing is recorded here; solve "
+            "a recording of fusecap live (.mcap), or name keypoints or a video"
+        )
     if camera.keypoints is None or landmarks is None:
         raise SessionError(
             f"{session.path}: camera '{camera.name}' has a video but no keypoints yet; run: "
