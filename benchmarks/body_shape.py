@@ -21,13 +21,13 @@ from pathlib import Path
 
 import numpy as np
 
+from fusecap.batch.solve import solve_instants
 from fusecap.body.landmarks import LandmarkOffsets, LandmarkSet, landmark_set_named
 from fusecap.body.motion_model import evaluate_series, theta_of_channels
 from fusecap.body.pose import forward_kinematics
 from fusecap.body.prior import load_prior
 from fusecap.body.shape import REFERENCE_HEIGHT_M, BodyShape
 from fusecap.body.skeleton import PAPER21
-from fusecap.calibrate.motion_clips import Clip, save_clips
 from fusecap.calibrate.shape import MeasuredBody, measure_bodies
 from fusecap.evaluate.imu_noise import IMUS_13
 from fusecap.evaluate.simulator import Person, Simulation, camera_ring, placed, simulate
@@ -40,8 +40,8 @@ from fusecap.evaluate.twin import (
     TWIN_KEYPOINT_NOISE,
     TWIN_RIG_NOISE,
 )
-from fusecap.offline.solve import solve_instants
-from fusecap.scene import Scene, make_sorter
+from fusecap.motion.clips import Clip, save_clips
+from fusecap.setup import Scene, make_sorter
 from fusecap.solve.estimator import SubjectModel
 from fusecap.solve.options import SolverOptions
 from fusecap.solve.pose_solver import ImuSites

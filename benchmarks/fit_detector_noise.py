@@ -24,6 +24,7 @@ from scipy.optimize import linear_sum_assignment, nnls
 from scipy.stats import rankdata
 from shelf import write_shelf_session
 
+from fusecap.batch.solve import solve_session
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.body.pose import landmarks_in_world
 from fusecap.evaluate.keypoint_noise import (
@@ -32,7 +33,6 @@ from fusecap.evaluate.keypoint_noise import (
     occluded,
     together,
 )
-from fusecap.offline.solve import solve_session
 from fusecap.sources.session import load_session
 from fusecap.sources.session_data import SessionData, open_session
 

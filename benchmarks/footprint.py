@@ -82,7 +82,7 @@ def start_up(bytecode: str) -> None:
 
 def compilation(bytecode: str) -> None:
     """Seconds of the first import of all kernels, and of the second."""
-    every = "import fusecap.offline.solve"
+    every = "import fusecap.batch.solve"
     with tempfile.TemporaryDirectory() as cache:
         first, second = (
             run(

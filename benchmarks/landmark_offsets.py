@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fusecap.batch.solve import solve_instants
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.calibrate.offsets import (
     OffsetSamples,
@@ -41,11 +42,10 @@ from fusecap.evaluate.twin import (
     twin_simulation,
     twin_training_sequences,
 )
-from fusecap.offline.solve import solve_instants
-from fusecap.scene import SessionInstants, scene_of
-from fusecap.sinks.take import Take
+from fusecap.setup import SessionInstants, scene_of
 from fusecap.sources.session import load_session
 from fusecap.sources.session_data import open_session
+from fusecap.take import Take
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
 sys.path.insert(0, str(Path(__file__).resolve().parent))

@@ -47,12 +47,12 @@ from live_scenes import (
     work_like_networks,
 )
 
-from fusecap.live.playback_sources import PlaybackOptions, playback_sources
+from fusecap.engine.live_setup import setup_of
+from fusecap.live.devices.playback_sources import PlaybackOptions, playback_sources
+from fusecap.live.devices.source import SessionClock
 from fusecap.live.recorder import Recorder
 from fusecap.live.report import LiveReport
 from fusecap.live.run import LiveOptions, LiveRun
-from fusecap.live.source import SessionClock
-from fusecap.online.setup import setup_of
 from fusecap.sources.session import load_session
 
 Prepare = Callable[[Path, argparse.Namespace], LiveRun]

@@ -20,7 +20,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 import live_scene
-from fusecap.online.engine import Engine
+from fusecap.engine.engine import Engine
 from live_events import merged
 from live_scene import Phase
 

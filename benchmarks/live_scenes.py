@@ -22,11 +22,11 @@ from fusecap.detect.detector import Detector, DetectorOptions
 from fusecap.evaluate.demo_scene import demo_scene
 from fusecap.evaluate.simulated_session import write_session
 from fusecap.evaluate.simulator import CameraTiming, Simulation, simulate
+from fusecap.live.devices.source import Deliver, Delivery, Source, SourceCounts
 from fusecap.live.outputs import first_cast
 from fusecap.live.run import LiveRun
-from fusecap.live.source import Deliver, Delivery, Source, SourceCounts
 from fusecap.live.stream_process import StreamProcess
-from fusecap.live.target import Target
+from fusecap.streams.target import Target
 from fusecap.types import CameraImage, CameraSample
 
 SHARED = Path(__file__).resolve().parents[1].parent / "shared"

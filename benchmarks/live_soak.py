@@ -38,17 +38,17 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from live_scenes import AsPictures, SimulatedDetector, receivers, send_to, simulated_session
 
-from fusecap.live.faults import Fault, FaultKind, FaultyDetector, with_faults
-from fusecap.live.playback_sources import PlaybackOptions, playback_sources
+from fusecap.engine.live_setup import setup_of
+from fusecap.engine.step import LiveStep
+from fusecap.live.devices.faults import Fault, FaultKind, FaultyDetector, with_faults
+from fusecap.live.devices.playback_sources import PlaybackOptions, playback_sources
+from fusecap.live.devices.source import SessionClock
 from fusecap.live.recorder import Recorder
 from fusecap.live.report import LiveReport
 from fusecap.live.run import LiveOptions, LiveRun
-from fusecap.live.source import SessionClock
 from fusecap.live.status import LiveStatus
-from fusecap.online.setup import setup_of
-from fusecap.online.step import LiveStep
-from fusecap.sinks.take import Take, load_take
 from fusecap.sources.session import load_session
+from fusecap.take import Take, load_take
 from fusecap.types import CameraImage, Event
 
 RATE_HZ = 60

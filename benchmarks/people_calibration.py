@@ -26,6 +26,7 @@ from pathlib import Path
 import numpy as np
 
 from fusecap import load_session, open_session
+from fusecap.batch.solve import solve_session
 from fusecap.calibrate.cameras.people import PeopleCalibration, check_rigs, refine_from_people
 from fusecap.calibrate.cameras.people_gauge import align, motions
 from fusecap.evaluate.demo_scene import demo_scene
@@ -33,7 +34,6 @@ from fusecap.evaluate.rig_noise import RigNoise, believed
 from fusecap.evaluate.score import score_take
 from fusecap.evaluate.simulated_session import write_session
 from fusecap.geometry.camera import Rig
-from fusecap.offline.solve import solve_session
 from fusecap.sources.calibration_files import aniposelib
 from fusecap.sources.session_data import SessionData
 

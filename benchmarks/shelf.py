@@ -15,11 +15,11 @@ import tempfile
 import time
 from pathlib import Path
 
+from fusecap.batch.solve import solve_session
 from fusecap.evaluate.shelf import ShelfScore, score_shelf
-from fusecap.offline.solve import solve_session
-from fusecap.sinks.take import Take, save_take
 from fusecap.sources.session import load_session
 from fusecap.sources.session_data import open_session
+from fusecap.take import Take, save_take
 
 CAMERAS = ("0", "1", "2", "3", "4")
 TRUTH = "gt_frames_000_149.txt"

@@ -58,9 +58,9 @@ from fusecap.evaluate.twin import (
     twin_sequences,
     twin_training_sequences,
 )
-from fusecap.sinks.take import Take
 from fusecap.sources.keypoint_files import KeypointTrack
 from fusecap.sources.session import parse_session
+from fusecap.take import Take
 
 RATES_HZ = (60.0, 30.0, 50.0, 60.0)
 STARTS_S = (0.0, 0.01, 0.02, 0.003)

@@ -23,6 +23,7 @@ import av
 import numpy as np
 import pytest
 
+from fusecap.batch.detect import detect_videos, session_scene, session_videos
 from fusecap.detect.build import build_detector
 from fusecap.detect.detector import DetectorOptions
 from fusecap.detect.packing import PackedPersonDetector
@@ -30,7 +31,6 @@ from fusecap.detect.person import PersonDetector
 from fusecap.detect.pose import PoseNetwork
 from fusecap.detect.runtimes.choice import open_network
 from fusecap.geometry.camera import Rig
-from fusecap.offline.detect import detect_videos, session_scene, session_videos
 from fusecap.sources.calibration_files import load_rig
 from fusecap.sources.calibration_files.writer import write_rig
 from fusecap.sources.session import load_session

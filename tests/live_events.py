@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
-from fusecap.online.engine import Engine
-from fusecap.online.setup import LiveSetup
-from fusecap.online.step import LiveStep
+from fusecap.engine.engine import Engine
+from fusecap.engine.live_setup import LiveSetup
+from fusecap.engine.step import LiveStep
 from fusecap.sources.session_data import SessionData, open_imus
 from fusecap.types import CameraSample, Event, ImuSample, Tick
 

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from fusecap.body.landmarks import LANDMARK_SETS
+from fusecap.engine.live_setup import LiveSetup
+from fusecap.engine.step import LiveStep
 from fusecap.geometry.camera import Rig
-from fusecap.live.source import Deliver, SessionClock, SourceCounts
-from fusecap.online.setup import LiveSetup
-from fusecap.online.step import LiveStep
+from fusecap.live.devices.source import Deliver, SessionClock, SourceCounts
 from fusecap.pipeline import Step
 from fusecap.sources.session import Session
 from fusecap.types import (

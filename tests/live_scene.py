@@ -15,6 +15,8 @@ from fusecap.body.landmarks import landmark_set_named
 from fusecap.body.motion_model import load_demo_motion
 from fusecap.body.shape import REFERENCE_HEIGHT_M, BodyShape
 from fusecap.body.skeleton import PAPER21
+from fusecap.engine.live_setup import LiveSetup
+from fusecap.engine.step import LiveStep
 from fusecap.evaluate import simulated_session
 from fusecap.evaluate.demo_scene import BYSTANDER_HEIGHT_M, SUBJECT_HEIGHTS_M, VOLUME_M
 from fusecap.evaluate.imu_noise import IMUS_13
@@ -26,8 +28,6 @@ from fusecap.evaluate.simulator import (
     placed,
     simulate,
 )
-from fusecap.online.setup import LiveSetup
-from fusecap.online.step import LiveStep
 from fusecap.sources.session import parse_session
 from fusecap.types import CameraSample, ImuSample, Tick
 from live_events import Sample

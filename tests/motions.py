@@ -6,7 +6,7 @@ import numpy as np
 
 from fusecap.body.shape import BodyShape
 from fusecap.body.skeleton import PAPER21, Skeleton
-from fusecap.sinks.take import Take, take_from_theta
+from fusecap.take import Take, take_from_theta
 
 
 def walk(

@@ -8,13 +8,13 @@ from typing import BinaryIO
 
 import numpy as np
 
+from fusecap.engine.engine import Engine
+from fusecap.engine.live_setup import LiveSetup
+from fusecap.engine.step import LiveStep
 from fusecap.evaluate.demo_scene import demo_scene
 from fusecap.evaluate.simulated_session import write_session
-from fusecap.online.engine import Engine
-from fusecap.online.setup import LiveSetup
-from fusecap.online.setup_json import setup_values
-from fusecap.online.step import LiveStep
-from fusecap.sinks.recording import RecordingWriter
+from fusecap.recording import RecordingWriter
+from fusecap.recording.setup_json import setup_values
 from fusecap.sources.session import load_session
 from fusecap.sources.session_data import open_session
 from fusecap.types import Command, CommandKind, Event

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fusecap.body.skeleton import PAPER21, Skeleton
-from fusecap.sinks.streams.person_pose import PersonPose, StreamFrame, pose_of_take
+from fusecap.streams.person_pose import PersonPose, StreamFrame, pose_of_take
 from motions import person, take_of
 
 

@@ -10,7 +10,7 @@ from bvh_reader import Bvh
 from fusecap.body.shape import end_offsets_m
 from fusecap.body.skeleton import EXTENDED23, PAPER21
 from fusecap.errors import InputError, TakeError
-from fusecap.sinks.bvh import euler_zxy_rad, export_bvh, write_bvh
+from fusecap.export.bvh import euler_zxy_rad, export_bvh, write_bvh
 from motions import any_poses, person, take_of, walk
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from fusecap.body.skeleton import EXTENDED23, PAPER21
-from fusecap.sinks.bvh import export_bvh
+from fusecap.export.bvh import export_bvh
 from motions import any_poses, person, take_of, walk
 
 SCRIPT = Path(__file__).parent / "blender" / "check_bvh.py"

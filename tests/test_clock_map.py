@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fusecap.online.clock_map import BELIEVED, JUMP_NS, ClockMap
+from fusecap.live.devices.clock_map import BELIEVED, JUMP_NS, ClockMap
 
 SHORTEST_S = 0.002
 

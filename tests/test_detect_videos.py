@@ -6,22 +6,22 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from fusecap.body.landmarks import landmark_set_named
-from fusecap.cli import app
-from fusecap.detect.build import build_detector
-from fusecap.detect.detector import DetectorOptions
-from fusecap.errors import InputError, SessionError
-from fusecap.offline.detect import (
+from fusecap.batch.detect import (
     detect_videos,
     detector_options,
     loose_videos,
     session_scene,
     session_videos,
 )
-from fusecap.offline.expected_people import ExpectedPeople
-from fusecap.offline.overlay import draw_overlays
-from fusecap.scene import scene_before
-from fusecap.sinks.overlay import PeopleNumbers
+from fusecap.batch.expected_people import ExpectedPeople
+from fusecap.batch.overlay import draw_overlays
+from fusecap.body.landmarks import landmark_set_named
+from fusecap.cli import app
+from fusecap.detect.build import build_detector
+from fusecap.detect.detector import DetectorOptions
+from fusecap.errors import InputError, SessionError
+from fusecap.export.overlay import PeopleNumbers
+from fusecap.setup import scene_before
 from fusecap.sources.detection_files import read_record
 from fusecap.sources.keypoint_files import read_keypoints
 from fusecap.sources.session import load_session
@@ -150,7 +150,7 @@ def drifting_detector(folder):
 
 @pytest.mark.parametrize("stop_after", [3, 13, 30])
 def test_interrupted_and_resumed_is_the_same_as_uninterrupted(tmp_path, monkeypatch, stop_after):
-    monkeypatch.setattr("fusecap.offline.detect.BLOCK_INSTANTS", 8)
+    monkeypatch.setattr("fusecap.batch.detect.BLOCK_INSTANTS", 8)
     detector = drifting_detector(tmp_path)
 
     def stop(what, done, total):

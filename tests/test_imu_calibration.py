@@ -33,7 +33,6 @@ from fusecap.evaluate.simulated_session import write_session
 from fusecap.evaluate.simulator import Person, camera_ring, placed, simulate
 from fusecap.evaluate.twin import twin_sequence
 from fusecap.geometry.camera import Y_UP_FROM_Z_UP
-from fusecap.sinks.take import take_from_theta
 from fusecap.sources.imu_calibration_files import (
     CalibratedImu,
     imu_calibration_toml,
@@ -41,6 +40,7 @@ from fusecap.sources.imu_calibration_files import (
 )
 from fusecap.sources.imu_files.track import GRAVITY_M_S2, ImuTrack
 from fusecap.sources.session import ImuSettings, SubjectSettings, load_session
+from fusecap.take import take_from_theta
 from session_files import edit
 
 BONES = ("hips", "left_forearm", "left_thigh", "right_thigh", "left_shank", "right_shank")

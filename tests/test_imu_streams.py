@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from fusecap.body.landmarks import landmark_set_named
 from fusecap.errors import InputError
-from fusecap.live.openpose_folder import MAX_PEOPLE, believable
+from fusecap.live.devices.openpose_folder import MAX_PEOPLE, believable
 from fusecap.sources.imu_streams.lsl import sensor_channels
 from fusecap.sources.imu_streams.mvn import mvn_packet
 from fusecap.sources.imu_streams.osc import osc_packet

@@ -58,7 +58,7 @@ def test_a_recording_played_as_if_live_is_solved_recorded_and_reported(session, 
 @pytest.mark.slow
 @pytest.mark.parametrize("signals", [1, 2])
 def test_ctrl_c_ends_a_run_with_success_and_a_whole_recording(session, tmp_path, signals):
-    from fusecap.sources.recording import Recording
+    from fusecap.recording.reader import Recording
 
     recording = tmp_path / "run.mcap"
     arguments = [session, "--playback", "--loop", "--record", recording, "--json"]

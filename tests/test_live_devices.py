@@ -18,16 +18,15 @@ import pytest
 
 from fusecap.body.landmarks import landmark_set_named
 from fusecap.errors import InputError
-from fusecap.live import grabbers
-from fusecap.live.cameras import UNSTAMPED_DELAY_S, CameraSource
-from fusecap.live.devices import device_sources
-from fusecap.live.genicam import GenICamGrabber
-from fusecap.live.grabbers import OpenCvGrabber, Picture, open_url, open_v4l2
-from fusecap.live.imus_lsl import LslImus
-from fusecap.live.imus_udp import UdpImus
-from fusecap.live.openpose_folder import OpenPoseSource
-from fusecap.live.sensor_feed import SensorFeed
-from fusecap.live.source import SessionClock, SourceLost
+from fusecap.live.devices.cameras import UNSTAMPED_DELAY_S, CameraSource
+from fusecap.live.devices.genicam import GenICamGrabber
+from fusecap.live.devices.grabbers import OpenCvGrabber, Picture, open_url, open_v4l2
+from fusecap.live.devices.imus_lsl import LslImus
+from fusecap.live.devices.imus_udp import UdpImus
+from fusecap.live.devices.open_devices import device_sources, grabbers
+from fusecap.live.devices.openpose_folder import OpenPoseSource
+from fusecap.live.devices.sensor_feed import SensorFeed
+from fusecap.live.devices.source import SessionClock, SourceLost
 from fusecap.sources.imu_streams.mvn import mvn_packet, mvn_sensor_name
 from fusecap.sources.imu_streams.osc import osc_packet
 from fusecap.sources.live_address import Capture, GenICam, V4l2, VideoUrl, Webcam

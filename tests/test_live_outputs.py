@@ -11,13 +11,13 @@ from pythonosc.osc_bundle import OscBundle
 from websockets.sync.client import connect
 
 from fusecap.errors import InputError
+from fusecap.live.devices.source import SessionClock
 from fusecap.live.latency import LatencyBook
 from fusecap.live.outputs import StreamOutput, first_cast
-from fusecap.live.source import SessionClock
-from fusecap.live.streams import VmcStream, open_stream
-from fusecap.live.target import Target, parse_target
-from fusecap.live.transports import Counts
-from fusecap.sinks.streams.person_pose import pose_of_estimate
+from fusecap.streams.person_pose import pose_of_estimate
+from fusecap.streams.streams import VmcStream, open_stream
+from fusecap.streams.target import Target, parse_target
+from fusecap.streams.transports import Counts
 from fusecap.types import Estimate
 from live_fakes import estimate_of, live_setup, step_of, wait_for
 from motions import person

@@ -11,9 +11,9 @@ import pytest
 
 from fusecap.body.landmarks import LANDMARK_SETS
 from fusecap.errors import InputError, SessionError
-from fusecap.live.faults import Fault, FaultKind, FaultyDetector, FaultySource
-from fusecap.live.playback_sources import PlaybackOptions, Stall, playback_sources
-from fusecap.live.source import Delivery, SessionClock, Source, SourceCounts, SourceLost
+from fusecap.live.devices.faults import Fault, FaultKind, FaultyDetector, FaultySource
+from fusecap.live.devices.playback_sources import PlaybackOptions, Stall, playback_sources
+from fusecap.live.devices.source import Delivery, SessionClock, Source, SourceCounts, SourceLost
 from fusecap.sources.session import load_session
 from fusecap.sources.session_data import open_session
 from fusecap.types import CameraImage, CameraSample, ImuSample

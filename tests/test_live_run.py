@@ -11,15 +11,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fusecap.live.devices.source import SessionClock, SourceLost
 from fusecap.live.health import Input, Meter
 from fusecap.live.inbox import Inbox
 from fusecap.live.incidents import Incidents
 from fusecap.live.latency import Arrivals, Histogram, LatencyBook
 from fusecap.live.record_switch import RecordSwitch
 from fusecap.live.run import LiveOptions, LiveRun
-from fusecap.live.source import SessionClock, SourceLost
 from fusecap.live.status import Light
-from fusecap.sources.recording import Recording
+from fusecap.recording.reader import Recording
 from fusecap.types import CameraSample, Command, CommandKind, ImuSample, Tick
 from live_fakes import (
     FakeDetector,

@@ -16,14 +16,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fusecap.live.faults import Fault, with_faults
-from fusecap.live.playback_sources import PlaybackOptions, playback_sources
-from fusecap.live.source import SessionClock, Source, SourceLost
-from fusecap.online.engine import Engine
-from fusecap.online.setup import setup_of
-from fusecap.online.step import LiveStep
-from fusecap.sinks.take import load_take
+from fusecap.engine.engine import Engine
+from fusecap.engine.live_setup import setup_of
+from fusecap.engine.step import LiveStep
+from fusecap.live.devices.faults import Fault, with_faults
+from fusecap.live.devices.playback_sources import PlaybackOptions, playback_sources
+from fusecap.live.devices.source import SessionClock, Source, SourceLost
 from fusecap.sources.session import load_session
+from fusecap.take import load_take
 from fusecap.types import Event, Tick
 
 SECONDS = 120.0

@@ -14,13 +14,13 @@ import pytest
 
 from fusecap.body.shape import BodyShape
 from fusecap.body.skeleton import PAPER21
+from fusecap.engine.step import LiveStep
 from fusecap.errors import InputError
+from fusecap.live.devices.source import SessionClock
 from fusecap.live.latency import EXPOSURE_TO_PACKET, LatencyBook
-from fusecap.live.source import SessionClock
 from fusecap.live.stream_process import StreamProcess
-from fusecap.live.target import Target
-from fusecap.online.step import LiveStep
 from fusecap.pipeline import Step
+from fusecap.streams.target import Target
 from fusecap.types import Detections, Estimate, Status
 
 SHAPE = BodyShape.from_height(PAPER21, 1.7)

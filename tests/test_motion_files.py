@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fusecap.calibrate.motion_files.amc import parse_amc, parse_asf
-from fusecap.calibrate.motion_files.bvh import parse_bvh
-from fusecap.calibrate.motion_files.expmap import parse_expmap
-from fusecap.calibrate.motion_files.folder import MotionFolder
-from fusecap.calibrate.motion_files.motion import CMU_UNIT_M
 from fusecap.errors import InputError
+from fusecap.motion.files.amc import parse_amc, parse_asf
+from fusecap.motion.files.bvh import parse_bvh
+from fusecap.motion.files.expmap import parse_expmap
+from fusecap.motion.files.folder import MotionFolder
+from fusecap.motion.motion import CMU_UNIT_M
 from motion_texts import BVH_TEXT, amc_text, asf_text, expmap_text
 
 

@@ -11,10 +11,10 @@ from fusecap.body.pose import forward_kinematics
 from fusecap.body.prior import PosePrior, load_prior, save_prior
 from fusecap.body.shape import BodyShape
 from fusecap.body.skeleton import EXTENDED23, PAPER21
-from fusecap.calibrate.demo_motion import CLIPS
-from fusecap.calibrate.prior import ACKNOWLEDGEMENT, mirrored, train_prior
-from fusecap.calibrate.retarget import sole_heights_m
 from fusecap.errors import InputError, MotionError
+from fusecap.motion.demo_motion import CLIPS
+from fusecap.motion.retarget import sole_heights_m
+from fusecap.motion.train_prior import ACKNOWLEDGEMENT, mirrored, train_prior
 from motion_texts import amc_text, asf_text
 
 SKELETONS = [PAPER21, EXTENDED23]

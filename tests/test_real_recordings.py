@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fusecap.batch.solve import solve_session
 from fusecap.doctor import diagnose
 from fusecap.evaluate.shelf import score_shelf
-from fusecap.offline.solve import solve_session
 from fusecap.sources.session import load_session
 from fusecap.sources.session_data import open_session
 

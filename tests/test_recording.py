@@ -26,13 +26,13 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
 from fusecap.body.landmarks import LANDMARK_SETS, LandmarkOffsets
+from fusecap.engine.live_setup import LiveSetup
 from fusecap.errors import InputError
+from fusecap.live.devices.source import SessionClock
 from fusecap.live.recorder import Recorder
-from fusecap.live.source import SessionClock
-from fusecap.online.setup import LiveSetup
-from fusecap.online.setup_json import setup_from_values, setup_values
-from fusecap.sinks.recording import RecordingWriter
-from fusecap.sources.recording import RecordedEvent, RecordedPose, Recording
+from fusecap.recording import RecordingWriter
+from fusecap.recording.reader import RecordedEvent, RecordedPose, Recording
+from fusecap.recording.setup_json import setup_from_values, setup_values
 from fusecap.sources.session import Session
 from fusecap.types import CameraImage, CameraSample, Command, CommandKind, ImuSample, Tick
 from live_fakes import estimate_of, wait_for
@@ -612,7 +612,7 @@ import sys, time
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 from fusecap.live.recorder import Recorder
-from fusecap.live.source import SessionClock
+from fusecap.live.devices.source import SessionClock
 from recorded_run import simulated_run
 
 folder = Path(sys.argv[1])

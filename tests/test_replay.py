@@ -10,20 +10,20 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from fusecap.batch.replay import Replay, recorded_take, replay, solve_as_live
+from fusecap.batch.second_solve import solve_recording
+from fusecap.batch.solve import solve_session
 from fusecap.body.landmarks import LANDMARK_SETS
 from fusecap.cli import app
 from fusecap.doctor import diagnose_recording
+from fusecap.engine.engine import Engine
+from fusecap.engine.live_setup import LiveSetup
 from fusecap.errors import InputError
 from fusecap.geometry.camera import Rig
-from fusecap.offline.replay import Replay, recorded_take, replay, solve_as_live
-from fusecap.offline.second_solve import solve_recording
-from fusecap.offline.solve import solve_session
-from fusecap.online.engine import Engine
-from fusecap.online.setup import LiveSetup
-from fusecap.sinks.take import load_take
-from fusecap.sources.recording import Recording
+from fusecap.recording.reader import Recording
 from fusecap.sources.session import Session, load_session
 from fusecap.sources.session_data import open_session
+from fusecap.take import load_take
 from fusecap.types import Command, CommandKind, ImuSample, Tick
 from live_events import same_bits
 from recorded_run import record, simulated_run

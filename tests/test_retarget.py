@@ -8,11 +8,11 @@ import pytest
 from fusecap.body.pose import forward_kinematics
 from fusecap.body.shape import BodyShape
 from fusecap.body.skeleton import EXTENDED23, PAPER21
-from fusecap.calibrate.motion_files.amc import parse_amc, parse_asf
-from fusecap.calibrate.motion_files.bvh import parse_bvh
-from fusecap.calibrate.motion_files.folder import MotionFolder
-from fusecap.calibrate.retarget import retarget, sole_heights_m
 from fusecap.errors import InputError
+from fusecap.motion.files.amc import parse_amc, parse_asf
+from fusecap.motion.files.bvh import parse_bvh
+from fusecap.motion.files.folder import MotionFolder
+from fusecap.motion.retarget import retarget, sole_heights_m
 from motion_texts import BVH_TEXT, amc_text, asf_text
 
 SHAPE = BodyShape.from_height(PAPER21, 1.75)

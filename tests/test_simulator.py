@@ -27,9 +27,9 @@ from fusecap.evaluate.simulator import (
     placed,
     simulate,
 )
-from fusecap.sinks.take import load_take
 from fusecap.sources.session import load_session
 from fusecap.sources.session_data import open_session
+from fusecap.take import load_take
 from motions import person, walk
 
 BODY25 = landmark_set_named("body25")

@@ -17,14 +17,14 @@ from pythonosc.osc_bundle import OscBundle
 from scipy.spatial.transform import Rotation
 
 from fusecap.body.skeleton import EXTENDED23, PAPER21
-from fusecap.sinks.streams.livelink import livelink_datagrams
-from fusecap.sinks.streams.lsl import lsl_channels, lsl_sample
-from fusecap.sinks.streams.osc import osc_datagrams, person_addresses
-from fusecap.sinks.streams.osc_packets import bundles, message
-from fusecap.sinks.streams.person_pose import pose_of_estimate, pose_of_take, with_clavicles
-from fusecap.sinks.streams.rokoko import rokoko_datagrams
-from fusecap.sinks.streams.vmc import vmc_datagrams
-from fusecap.sinks.streams.websocket import cast_message, frame_bytes, frame_text
+from fusecap.streams.livelink import livelink_datagrams
+from fusecap.streams.lsl import lsl_channels, lsl_sample
+from fusecap.streams.osc import osc_datagrams, person_addresses
+from fusecap.streams.osc_packets import bundles, message
+from fusecap.streams.person_pose import pose_of_estimate, pose_of_take, with_clavicles
+from fusecap.streams.rokoko import rokoko_datagrams
+from fusecap.streams.vmc import vmc_datagrams
+from fusecap.streams.websocket import cast_message, frame_bytes, frame_text
 from fusecap.types import Estimate, Status
 from motions import any_poses, person
 from stream_people import (

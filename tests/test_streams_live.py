@@ -22,11 +22,11 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from fusecap.errors import InputError, TakeError
-from fusecap.live.playback import TakePlayer, play
-from fusecap.live.streams import WebSocketStream, open_stream
-from fusecap.live.target import Target, parse_target
-from fusecap.live.transports import Counts, UdpSender, WebSocketServer
-from fusecap.sinks.take import save_take
+from fusecap.streams.play_take import TakePlayer, play
+from fusecap.streams.streams import WebSocketStream, open_stream
+from fusecap.streams.target import Target, parse_target
+from fusecap.streams.transports import Counts, UdpSender, WebSocketServer
+from fusecap.take import save_take
 from motions import person, take_of, walk
 
 RATE_HZ = 50.0
@@ -418,9 +418,9 @@ LSL_PROGRAM = """
 import sys
 sys.path[:0] = {paths}
 import numpy as np, pylsl, test_streams_live as t
-from fusecap.live.playback import TakePlayer
-from fusecap.live.streams import open_stream
-from fusecap.live.target import parse_target
+from fusecap.streams.play_take import TakePlayer
+from fusecap.streams.streams import open_stream
+from fusecap.streams.target import parse_target
 from motions import person, take_of, walk
 take = take_of(walk(person(), 25)[None], [person()], names=("anna",), rate_hz=50.0)
 player = TakePlayer(take)

@@ -8,8 +8,8 @@ import pytest
 from fusecap.body.pose import forward_kinematics
 from fusecap.body.skeleton import EXTENDED23, PAPER21
 from fusecap.errors import TakeError
-from fusecap.sinks.files import written_whole
-from fusecap.sinks.take import Take, TakeBuilder, load_take, provenance, save_take
+from fusecap.files import written_whole
+from fusecap.take import Take, TakeBuilder, load_take, provenance, save_take
 from fusecap.types import Estimate, Status
 from motions import any_poses, person, take_of, walk
 

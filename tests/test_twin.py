@@ -12,8 +12,6 @@ from fusecap.body.motion_model import load_twin_motion
 from fusecap.body.pose import forward_kinematics
 from fusecap.body.prior import load_prior
 from fusecap.body.skeleton import PAPER21
-from fusecap.calibrate.prior import CMU_HELD_OUT
-from fusecap.calibrate.twin_motion import TEST_CLIPS, TRAINING_CLIPS
 from fusecap.errors import InputError
 from fusecap.evaluate.imu_noise import IMUS_6, IMUS_13
 from fusecap.evaluate.twin import (
@@ -28,6 +26,8 @@ from fusecap.evaluate.twin import (
     twin_simulation,
     twin_training_sequences,
 )
+from fusecap.motion.train_prior import CMU_HELD_OUT
+from fusecap.motion.twin_motion import TEST_CLIPS, TRAINING_CLIPS
 
 
 def test_eight_sequences_of_five_subjects_of_ten_seconds():

@@ -24,6 +24,8 @@ from websockets.typing import Origin, Subprotocol
 from fusecap.body.pose import landmarks_in_world
 from fusecap.body.skeleton import EXTENDED23, PAPER21
 from fusecap.cli import app
+from fusecap.engine.live_setup import LiveSetup
+from fusecap.engine.step import LiveStep
 from fusecap.errors import InputError, TakeError
 from fusecap.evaluate.errors_over_time import errors_over_time
 from fusecap.live.status import (
@@ -35,10 +37,8 @@ from fusecap.live.status import (
     StageLatency,
     StreamStatus,
 )
-from fusecap.online.setup import LiveSetup
-from fusecap.online.step import LiveStep
 from fusecap.pipeline import Step
-from fusecap.sinks.take import Take
+from fusecap.take import Take
 from fusecap.types import (
     CameraImage,
     CameraSample,

@@ -9,19 +9,19 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from fusecap.batch.solve import Solved, SolveReport, solve_session
     from fusecap.body.landmarks import LandmarkSet, landmark_set_named
     from fusecap.body.prior import PosePrior, load_prior
     from fusecap.body.shape import BodyShape
     from fusecap.body.skeleton import EXTENDED23, PAPER21, Skeleton
     from fusecap.errors import FusecapError
     from fusecap.geometry.camera import Camera, Rig
-    from fusecap.offline.solve import Solved, SolveReport, solve_session
-    from fusecap.sinks.take import Take, load_take, save_take
     from fusecap.solve.estimator import Estimator, SubjectModel
     from fusecap.solve.options import SolverOptions, Weights
     from fusecap.solve.pose_solver import ImuSites
     from fusecap.sources.session import Session, load_session
     from fusecap.sources.session_data import open_session
+    from fusecap.take import Take, load_take, save_take
     from fusecap.types import Detections, Estimate, ImuReading, Observation, Status
 
 _HOME = {
@@ -36,12 +36,12 @@ _HOME = {
     "FusecapError": "errors",
     "Camera": "geometry.camera",
     "Rig": "geometry.camera",
-    "Solved": "offline.solve",
-    "SolveReport": "offline.solve",
-    "solve_session": "offline.solve",
-    "Take": "sinks.take",
-    "load_take": "sinks.take",
-    "save_take": "sinks.take",
+    "Solved": "batch.solve",
+    "SolveReport": "batch.solve",
+    "solve_session": "batch.solve",
+    "Take": "take",
+    "load_take": "take",
+    "save_take": "take",
     "Estimator": "solve.estimator",
     "SubjectModel": "solve.estimator",
     "SolverOptions": "solve.options",

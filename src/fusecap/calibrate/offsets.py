@@ -45,16 +45,16 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.optimize import linear_sum_assignment
 
+from fusecap.batch.solve import Progress, solve_instants
 from fusecap.body.landmarks import LANDMARKS, LandmarkOffsets, LandmarkSet
 from fusecap.body.pose import landmarks_in_world
 from fusecap.errors import InputError
 from fusecap.evaluate.metrics import Summary, summarize
 from fusecap.geometry.camera import Rig
 from fusecap.geometry.triangulation import triangulate
-from fusecap.offline.solve import Progress, solve_instants
-from fusecap.scene import SessionInstants, scene_of
-from fusecap.sinks.take import Take
+from fusecap.setup import SessionInstants, scene_of
 from fusecap.sources.session_data import SessionData
+from fusecap.take import Take
 from fusecap.types import Detections
 
 MIN_SAMPLES = 20

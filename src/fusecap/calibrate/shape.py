@@ -28,6 +28,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from fusecap.batch.solve import Progress, solve_instants
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.body.shape import MAX_HEIGHT_M, MIN_HEIGHT_M, BodyShape
 from fusecap.body.skeleton import Skeleton
@@ -40,11 +41,10 @@ from fusecap.calibrate.offsets import (
 )
 from fusecap.errors import InputError, nearest
 from fusecap.evaluate.metrics import Summary
-from fusecap.offline.solve import Progress, solve_instants
-from fusecap.scene import Instants, Scene
-from fusecap.sinks.take import Take
+from fusecap.setup import Instants, Scene
 from fusecap.solve.estimator import SubjectModel
 from fusecap.sources.toml_text import quoted
+from fusecap.take import Take
 
 ROUNDS = 2
 LENGTH_SIGMA = 0.04

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from fusecap.calibrate.shape import MeasuredBody
-from fusecap.sinks.files import written_whole
+from fusecap.files import written_whole
 
 
 def plot_bodies(bodies: Sequence[MeasuredBody], path: Path) -> None:

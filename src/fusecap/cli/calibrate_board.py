@@ -43,7 +43,7 @@ def board(
     """Draw a calibration board in exact millimetres to print, and write its board file."""
     from fusecap.calibrate.cameras import board_drawing
     from fusecap.calibrate.cameras.board import CHARUCO, KINDS, Board
-    from fusecap.sinks.files import written_whole
+    from fusecap.files import written_whole
 
     check_choice("--kind", kind, KINDS)
     check_choice("the suffix of --out", out.suffix, (".pdf", ".png"))

@@ -52,8 +52,8 @@ def imu(
     Residuals are measured on stretches of time that were left out.
     """
     from fusecap.calibrate.imus import session as calibration
-    from fusecap.sinks.take import load_take
     from fusecap.sources.session import load_session
+    from fusecap.take import load_take
 
     check_choice("--from", source, ("motion", "tpose"))
     if source == "tpose" and (take is not None or optical or identify):
@@ -90,7 +90,7 @@ def _report(found: tuple[SubjectCalibration, ...], out: Path, as_json: bool) -> 
 
     from fusecap.calibrate.imus.plot import plot_residuals
     from fusecap.calibrate.imus.session import calibrated_imus
-    from fusecap.sinks.files import safe_name
+    from fusecap.files import safe_name
 
     imus = calibrated_imus(found)
     seconds = ", ".join(f"{each.duration_s:.1f} s of '{each.subject}'" for each in found)
@@ -275,7 +275,7 @@ def _print_tpose(found: list[tuple[CalibratedImu, TPose]]) -> None:
 
 
 def _write(imus: list[CalibratedImu], out: Path, origin: str) -> list[Path]:
-    from fusecap.sinks.files import written_whole
+    from fusecap.files import written_whole
     from fusecap.sources.imu_calibration_files import imu_calibration_toml
 
     if not imus:

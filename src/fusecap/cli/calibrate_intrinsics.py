@@ -115,7 +115,7 @@ def write_report(out: Path, report: dict[str, Any]) -> Path:
     """The report beside the calibration, as `<name>_report.json`."""
     import json
 
-    from fusecap.sinks.files import written_whole
+    from fusecap.files import written_whole
 
     path = out.with_name(f"{out.stem}_report.json")
     with written_whole(path) as file:

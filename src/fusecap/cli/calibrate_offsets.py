@@ -34,11 +34,11 @@ def offsets(
     from dataclasses import asdict
 
     from fusecap.calibrate.offsets import calibrate_session, origin
-    from fusecap.sinks.files import written_whole
-    from fusecap.sinks.take import load_take
+    from fusecap.files import written_whole
     from fusecap.sources.offset_files import offsets_toml
     from fusecap.sources.session import load_session
     from fusecap.sources.session_data import open_session
+    from fusecap.take import load_take
 
     take = load_take(truth) if truth else None
     with progress(quiet=as_json) as show:

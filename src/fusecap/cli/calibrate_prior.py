@@ -26,7 +26,7 @@ def prior(
 
     from fusecap.body.prior import save_prior
     from fusecap.body.skeleton import skeleton_named
-    from fusecap.calibrate.prior import train_prior
+    from fusecap.motion.train_prior import train_prior
 
     body = skeleton_named(skeleton)
     with progress(quiet=as_json) as show:

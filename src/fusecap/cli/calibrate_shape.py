@@ -12,7 +12,7 @@ from fusecap.cli.common import Json, SessionPath, console, err, print_json, prog
 
 if TYPE_CHECKING:
     from fusecap.calibrate.shape import MeasuredBody, ShapeCalibration
-    from fusecap.scene import Scene
+    from fusecap.setup import Scene
     from fusecap.solve.estimator import SubjectModel
     from fusecap.sources.session_data import SessionData
 
@@ -39,8 +39,8 @@ def shape(
 
     from fusecap.calibrate.shape import calibrate_shape, shape_toml
     from fusecap.calibrate.shape_plot import plot_bodies
-    from fusecap.scene import SessionInstants
-    from fusecap.sinks.files import written_whole
+    from fusecap.files import written_whole
+    from fusecap.setup import SessionInstants
     from fusecap.sources.session import load_session
     from fusecap.sources.session_data import open_session
 
@@ -94,7 +94,7 @@ def shape(
 def _scene(data: SessionData, subjects: Sequence[SubjectModel] | None) -> Scene:
     from dataclasses import replace
 
-    from fusecap.scene import make_sorter, scene_of
+    from fusecap.setup import make_sorter, scene_of
 
     scene = scene_of(data)
     if subjects is None:

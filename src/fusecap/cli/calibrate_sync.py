@@ -40,7 +40,7 @@ def sync(
     from dataclasses import asdict
 
     from fusecap.calibrate.sync.session import synchronise
-    from fusecap.sinks.files import written_whole
+    from fusecap.files import written_whole
     from fusecap.sources.session import missing_files, parse_session
     from fusecap.sources.sync_files import sync_toml
 
@@ -100,7 +100,7 @@ def _name(path: Path) -> bool:
     import re
     import tomllib
 
-    from fusecap.sinks.files import written_whole
+    from fusecap.files import written_whole
 
     text = path.read_text(encoding="utf-8")
     if "sync" in tomllib.loads(text).get("session", {}):

@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     from fusecap.calibrate.cameras.board import Board, BoardView
     from fusecap.calibrate.cameras.resting_imu import RestingImu
     from fusecap.calibrate.cameras.world_frame import Placement
+    from fusecap.findings import Finding
     from fusecap.geometry.camera import Rig
     from fusecap.geometry.similarity import Similarity
-    from fusecap.sources.findings import Finding
     from fusecap.sources.marked_points import MarkedPoints
 
 EXAMPLE = (

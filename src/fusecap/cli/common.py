@@ -14,8 +14,8 @@ from rich.console import Console
 from fusecap.errors import nearest
 
 if TYPE_CHECKING:
-    from fusecap.offline.solve import Solved
-    from fusecap.sinks.take import Take
+    from fusecap.batch.solve import Solved
+    from fusecap.take import Take
 
 err = Console(stderr=True, highlight=False, emoji=False)
 console = Console(highlight=False, emoji=False)
@@ -78,8 +78,8 @@ def progress(*, quiet: bool, rate: bool = False) -> Iterator[Callable[[str, int,
 def write_take(
     take: Take, path: Path, *, exports: list[str], unit: str, picture: bool
 ) -> list[Path]:
-    from fusecap.sinks.bvh import export_bvh
-    from fusecap.sinks.take import save_take
+    from fusecap.export.bvh import export_bvh
+    from fusecap.take import save_take
 
     save_take(take, path)
     files = [path]
@@ -87,7 +87,7 @@ def write_take(
         files += export_bvh(take, path.parent, stem=path.stem, unit=unit)
     frames = len(take.timestamps_ns)
     if picture and frames:
-        from fusecap.sinks.plot import plot_take
+        from fusecap.export.plot import plot_take
 
         image = path.with_suffix(".png")
         plot_take(take, sorted({0, frames // 3, 2 * frames // 3, frames - 1}), image)

@@ -20,7 +20,7 @@ from fusecap.cli.common import (
 
 if TYPE_CHECKING:
     from fusecap.evaluate.simulator import Simulation
-    from fusecap.sinks.take import Take
+    from fusecap.take import Take
 
 EXAMPLE = "Example: fusecap demo --out demo --json"
 

@@ -11,7 +11,7 @@ from fusecap.cli.common import Json, check_choice, console, err, print_json, pro
 from fusecap.errors import InputError
 
 if TYPE_CHECKING:
-    from fusecap.offline.detect import Detected
+    from fusecap.batch.detect import Detected
     from fusecap.sources.session import Session
 
 EXAMPLE = "Example: fusecap detect recordings/duo --overlay"
@@ -53,15 +53,15 @@ def detect(
     as_json: Json = False,
 ) -> None:
     """Find everyone's keypoints in videos, as OpenPose JSON; goes on where it was stopped."""
-    from fusecap.detect.build import build_detector
-    from fusecap.detect.runtimes.choice import RUNTIMES
-    from fusecap.offline.detect import (
+    from fusecap.batch.detect import (
         detect_videos,
         detector_options,
         loose_videos,
         session_scene,
         session_videos,
     )
+    from fusecap.detect.build import build_detector
+    from fusecap.detect.runtimes.choice import RUNTIMES
     from fusecap.sources.session import load_session
 
     if runtime is not None:
@@ -89,7 +89,7 @@ def detect(
         found = detect_videos(cameras, detector, scene=scene, progress=show)
         files = []
         if overlay and not found.interrupted:
-            from fusecap.offline.overlay import draw_overlays
+            from fusecap.batch.overlay import draw_overlays
 
             files = draw_overlays(cameras, detector.landmarks, show)
     if as_json:
@@ -106,13 +106,13 @@ def detect(
 
 def detect_missing(session: Session, *, quiet: bool) -> Detected | None:
     """Detects the session's videos that have no keypoints yet; None without such videos."""
-    from fusecap.detect.build import build_detector
-    from fusecap.offline.detect import (
+    from fusecap.batch.detect import (
         detect_videos,
         detector_options,
         session_scene,
         session_videos,
     )
+    from fusecap.detect.build import build_detector
 
     cameras = session_videos(session, undetected=True)
     if not cameras:

@@ -48,11 +48,11 @@ def session(
     as_json: Json = False,
 ) -> None:
     """Solve a session and score it against its truth, as `fusecap simulate` writes it."""
+    from fusecap.batch.solve import solve_session
     from fusecap.evaluate.datasets.session import session_table
-    from fusecap.offline.solve import solve_session
-    from fusecap.sinks.take import load_take
     from fusecap.sources.session import load_session
     from fusecap.sources.session_data import open_session
+    from fusecap.take import load_take
 
     loaded = load_session(session)
     known = load_take(truth or loaded.folder / "truth.npz")

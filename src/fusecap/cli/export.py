@@ -25,8 +25,8 @@ def export(
 
     Of a recording: the poses as they were sent in the run; fusecap solve makes better ones.
     """
-    from fusecap.offline.replay import open_take
-    from fusecap.sinks.bvh import export_bvh
+    from fusecap.batch.replay import open_take
+    from fusecap.export.bvh import export_bvh
 
     check_choice("--format", format, EXPORTS)
     check_choice("--unit", unit, ("m", "cm"))

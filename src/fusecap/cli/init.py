@@ -20,7 +20,7 @@ def init(
 ) -> None:
     """Write a first session.toml from the videos, keypoints, calibration, sensors in a folder."""
     from fusecap.errors import SessionError
-    from fusecap.sinks.files import written_whole
+    from fusecap.files import written_whole
     from fusecap.sources.folder_survey import survey
     from fusecap.sources.session import FILE_NAME
     from fusecap.sources.session_draft import draft

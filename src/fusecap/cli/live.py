@@ -17,12 +17,12 @@ from fusecap.cli.targets import TO_HELP, placed_targets, warn_if_open
 from fusecap.errors import InputError
 
 if TYPE_CHECKING:
-    from fusecap.live.playback_sources import PlaybackOptions, Stall
+    from fusecap.live.devices.playback_sources import PlaybackOptions, Stall
     from fusecap.live.record_switch import RecordSwitch
     from fusecap.live.run import LiveRun
     from fusecap.live.stream_process import RemoteOutput
-    from fusecap.live.target import Target
     from fusecap.sources.session import Session
+    from fusecap.streams.target import Target
     from fusecap.viewer.live import LiveViewer
 
 EXAMPLE = "Example: fusecap live studio --to vmc://127.0.0.1:39539 --to ws --view"
@@ -104,10 +104,10 @@ def live(
     Ctrl-C ends the run and leaves a whole recording.
     """
     from fusecap.cli.live_status import LiveLine, print_report
+    from fusecap.live.devices.source import SessionClock
     from fusecap.live.opening import check_live, open_setup, open_sources
     from fusecap.live.record_switch import RecordSwitch
     from fusecap.live.run import LiveOptions, LiveRun
-    from fusecap.live.source import SessionClock
     from fusecap.sources.session import load_session
 
     if no_record and (record is not None or record_images):
@@ -163,7 +163,7 @@ def _playback(
     loss: float,
     stalls: Sequence[str],
 ) -> PlaybackOptions | None:
-    from fusecap.live.playback_sources import PlaybackOptions
+    from fusecap.live.devices.playback_sources import PlaybackOptions
 
     if not wanted:
         if loop or in_memory or jitter_ms or loss or stalls:
@@ -182,7 +182,7 @@ def _playback(
 
 
 def _stall(text: str) -> Stall:
-    from fusecap.live.playback_sources import Stall
+    from fusecap.live.devices.playback_sources import Stall
 
     source, *numbers = text.rsplit(":", 2)
     try:
@@ -210,7 +210,7 @@ def _add_outputs(run: LiveRun, targets: Sequence[Target]) -> tuple[RemoteOutput,
 
 def recording_path(session: Session) -> Path:
     """A name of its own for each recording, beside the session."""
-    from fusecap.sinks.files import safe_name
+    from fusecap.files import safe_name
 
     now = datetime.now().strftime("%Y-%m-%d-%H%M%S")
     return session.folder / f"{safe_name(session.settings.name)}-{now}.mcap"

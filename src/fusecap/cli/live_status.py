@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 from fusecap.cli.common import console, err
 
 if TYPE_CHECKING:
+    from fusecap.engine.step import LiveStep
     from fusecap.live.report import LiveReport
     from fusecap.live.run import LiveRun
     from fusecap.live.status import LiveStatus, SourceStatus, StageLatency
-    from fusecap.online.step import LiveStep
     from fusecap.types import CameraImage, Event
 
 _INCIDENTS = 30

@@ -11,7 +11,7 @@ from fusecap.cli.common import Json, check_choice, console, print_json, progress
 from fusecap.errors import InputError
 
 if TYPE_CHECKING:
-    from fusecap.calibrate.scene_motion import MotionClip
+    from fusecap.evaluate.scene_motion import MotionClip
     from fusecap.evaluate.simulator import CameraTiming, Person
     from fusecap.geometry.camera import Rig
 
@@ -169,7 +169,7 @@ def _people(
     """Everyone in one room, and the volume that bystanders stay out of."""
     import numpy as np
 
-    from fusecap.calibrate.scene_motion import load_motion, spread_out
+    from fusecap.evaluate.scene_motion import load_motion, spread_out
     from fusecap.evaluate.simulator import Person, placed
 
     bones = _bones(imus)

@@ -23,7 +23,7 @@ from fusecap.cli.common import (
 from fusecap.errors import InputError
 
 if TYPE_CHECKING:
-    from fusecap.offline.solve import Solved, SolveReport
+    from fusecap.batch.solve import Solved, SolveReport
 
 EXAMPLE = (
     "Example: fusecap solve recordings/duo --export bvh; of a live run: "
@@ -65,9 +65,9 @@ def solve(
     A recording is solved from all that was recorded, in two passes; with --as-live its events are
     gone through as in the run, and the poses are compared with those recorded.
     """
+    from fusecap.batch.solve import solve_session
     from fusecap.cli.detect import detect_missing, print_detection
-    from fusecap.offline.solve import solve_session
-    from fusecap.sinks.files import safe_name
+    from fusecap.files import safe_name
     from fusecap.sources.session import load_session
     from fusecap.sources.session_data import open_session
 
@@ -107,9 +107,9 @@ def _solve_recording(
     as_live: bool,
     quiet: bool,
 ) -> None:
-    from fusecap.offline.replay import solve_as_live
-    from fusecap.offline.second_solve import solve_recording
-    from fusecap.sources.recording import Recording
+    from fusecap.batch.replay import solve_as_live
+    from fusecap.batch.second_solve import solve_recording
+    from fusecap.recording.reader import Recording
 
     ending = "-as-live.npz" if as_live else ".npz"
     target = _take_path(out, path.with_name(path.stem + ending))

@@ -14,8 +14,8 @@ from fusecap.cli.common import Json, console, err, print_json
 from fusecap.cli.targets import TO_HELP, placed_targets, warn_if_open
 
 if TYPE_CHECKING:
-    from fusecap.live.playback import PlaybackState, TakePlayer
-    from fusecap.live.streams import Stream
+    from fusecap.streams.play_take import PlaybackState, TakePlayer
+    from fusecap.streams.streams import Stream
 
 EXAMPLE = "Example: fusecap stream demo/demo.npz --to vmc://127.0.0.1:39539 --to ws --loop"
 
@@ -50,9 +50,9 @@ def stream(
 
     Receivers, ports and axes are in docs/streams.md. Ctrl-C ends it.
     """
-    from fusecap.live.playback import TakePlayer, play
-    from fusecap.live.streams import open_stream
-    from fusecap.sinks.take import load_take
+    from fusecap.streams.play_take import TakePlayer, play
+    from fusecap.streams.streams import open_stream
+    from fusecap.take import load_take
 
     targets = placed_targets(to, host)
     loaded = load_take(take)

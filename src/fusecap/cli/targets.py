@@ -10,7 +10,7 @@ from fusecap.cli.common import err
 from fusecap.errors import InputError
 
 if TYPE_CHECKING:
-    from fusecap.live.target import Target
+    from fusecap.streams.target import Target
 
 TO_HELP = (
     "Where to: vmc, livelink, rokoko, osc, each with ://HOST:PORT unless the usual port of this "
@@ -25,7 +25,7 @@ def placed_targets(
 
     `other_servers` says that the command serves something else there as well. Raises `InputError`.
     """
-    from fusecap.live.target import is_loopback, parse_target
+    from fusecap.streams.target import is_loopback, parse_target
 
     targets = [parse_target(text) for text in to]
     if host is not None and not other_servers and all(t.protocol != "ws" for t in targets):
@@ -50,7 +50,7 @@ def placed_targets(
 
 def warn_if_open(target: Target) -> None:
     """Say so where other machines can connect."""
-    from fusecap.live.target import is_loopback
+    from fusecap.streams.target import is_loopback
 
     if target.protocol == "ws" and not is_loopback(target.host):
         err.print(

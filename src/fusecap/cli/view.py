@@ -14,7 +14,7 @@ from fusecap.cli.common import Json, console, err, print_json
 
 if TYPE_CHECKING:
     from fusecap.geometry.camera import Rig
-    from fusecap.sinks.take import Take
+    from fusecap.take import Take
     from fusecap.viewer.curves import Curve
     from fusecap.viewer.page import Page
     from fusecap.viewer.recording import RecordedDetections
@@ -57,10 +57,10 @@ def view(
 
     Nothing leaves this machine. Ctrl-C ends it.
     """
-    from fusecap.sinks.take import load_take
-    from fusecap.sources.recording import SUFFIX
+    from fusecap.recording.reader import SUFFIX
     from fusecap.sources.session import parse_session
     from fusecap.sources.session_data import open_rig
+    from fusecap.take import load_take
 
     detections = None
     if take.suffix == SUFFIX:
@@ -124,8 +124,8 @@ def look(
 
 def _recorded(path: Path) -> tuple[Take, RecordedDetections | None]:
     """The poses of a recording, and its detections where it has cameras."""
-    from fusecap.offline.replay import loss_notes, recorded_setup, recorded_take
-    from fusecap.sources.recording import Recording
+    from fusecap.batch.replay import loss_notes, recorded_setup, recorded_take
+    from fusecap.recording.reader import Recording
     from fusecap.viewer.recording import RecordedDetections
 
     recording = Recording(path)

@@ -17,7 +17,7 @@ DEFAULT_PERSON_MODEL = "rtmdet-nano-person"
 REVISION = 3
 """Of the way from images to keypoints. Raise it with every change that gives other keypoints for
 the same video: colours of decoded pictures, crops, decoding of outputs, thresholds, who is kept,
-when the person detector runs, where people are expected (`fusecap.offline`). Keypoints of another
+when the person detector runs, where people are expected (`fusecap.batch`). Keypoints of another
 revision are detected anew."""
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from fusecap.batch.detect import detector_options
 from fusecap.detect.detector import DetectorOptions
 from fusecap.detect.model_store import model_path, to_download
 from fusecap.detect.runtimes.choice import runtime_for
 from fusecap.doctor.videos import check_videos
 from fusecap.errors import FusecapError
-from fusecap.offline.detect import detector_options
-from fusecap.sources.findings import Findings
+from fusecap.findings import Findings
 from fusecap.sources.session import Session
 
 

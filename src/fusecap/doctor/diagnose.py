@@ -13,8 +13,8 @@ from fusecap.doctor.imus import check_imus
 from fusecap.doctor.keypoints import check_keypoints
 from fusecap.doctor.views import check_views
 from fusecap.errors import FusecapError
+from fusecap.findings import Finding, Findings, Severity
 from fusecap.geometry.camera import Rig
-from fusecap.sources.findings import Finding, Findings, Severity
 from fusecap.sources.keypoint_files import KeypointTrack
 from fusecap.sources.session import (
     FILE_NAME,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from fusecap.doctor.videos import check_videos
-from fusecap.sources.findings import Findings
+from fusecap.findings import Findings
 from fusecap.sources.folder_survey import FolderSurvey, survey
 from fusecap.sources.session import FILE_NAME
 

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fusecap.errors import FusecapError
-from fusecap.sources.findings import Findings
+from fusecap.findings import Findings
 from fusecap.sources.imu_files import read_imu
 from fusecap.sources.imu_files.track import GRAVITY_M_S2, ImuTrack
 from fusecap.sources.session import ImuSettings, Session

@@ -6,8 +6,8 @@ import numpy as np
 
 from fusecap.body.landmarks import LANDMARK_SETS, LandmarkSet
 from fusecap.errors import FusecapError
+from fusecap.findings import Findings
 from fusecap.geometry.camera import Camera, Rig
-from fusecap.sources.findings import Findings
 from fusecap.sources.keypoint_files import KeypointTrack, read_keypoints
 from fusecap.sources.session import Session
 from fusecap.sources.session_data import Progress, broken_files, common_landmarks

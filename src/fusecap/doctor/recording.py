@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from fusecap.offline.replay import recorded_setup
-from fusecap.offline.solve import Progress
-from fusecap.sources.findings import Finding, Findings, Severity
-from fusecap.sources.recording import RecordedEvent, RecordedPose, Recording
+from fusecap.batch.replay import recorded_setup
+from fusecap.batch.solve import Progress
+from fusecap.findings import Finding, Findings, Severity
+from fusecap.recording.reader import RecordedEvent, RecordedPose, Recording
 from fusecap.types import CameraSample, ImuSample, Tick
 
 GAP_S = 0.2

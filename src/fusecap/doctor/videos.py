@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from fusecap.errors import FusecapError
-from fusecap.sources.findings import Findings
+from fusecap.findings import Findings
 from fusecap.sources.video import Video, VideoInfo
 
 UNEQUAL_S = 0.5

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from fusecap.findings import Findings
 from fusecap.geometry.camera import Rig
 from fusecap.sources import view_agreement
 from fusecap.sources.calibration_files.loader import Y_UP_FROM
-from fusecap.sources.findings import Findings
 from fusecap.sources.keypoint_files import KeypointTrack
 from fusecap.sources.session import Session
 

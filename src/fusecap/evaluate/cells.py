@@ -22,8 +22,8 @@ from fusecap.evaluate.twin import (
     twin_sequence,
     twin_simulation,
 )
-from fusecap.sinks.take import Take
 from fusecap.solve.options import SolverOptions, Weights
+from fusecap.take import Take
 
 LIMBS_12 = tuple(
     f"{side}_{part}"

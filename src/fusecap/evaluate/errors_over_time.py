@@ -10,7 +10,7 @@ from jaxtyping import Float
 from fusecap.errors import TakeError
 from fusecap.evaluate.metrics import match_people, orientation_error_rad, position_error_m
 from fusecap.evaluate.score import same_instants
-from fusecap.sinks.take import Take
+from fusecap.take import Take
 
 
 @dataclass(frozen=True, kw_only=True)

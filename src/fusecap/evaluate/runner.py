@@ -32,7 +32,7 @@ from typing import Any
 
 import fusecap
 from fusecap.errors import InputError
-from fusecap.sinks.files import written_whole
+from fusecap.files import written_whole
 
 Work = Callable[[Any], dict[str, Any]]
 Progress = Callable[["Outcome", int, int], None]

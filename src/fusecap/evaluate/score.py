@@ -29,7 +29,7 @@ from fusecap.evaluate.metrics import (
     standing_heights_m,
     summarize,
 )
-from fusecap.sinks.take import Take
+from fusecap.take import Take
 
 SAME_INSTANT_NS = 1_000_000
 """Frames of a take and of its truth that are this close show one instant."""

@@ -22,7 +22,7 @@ from fusecap.body.landmarks import LANDMARKS
 from fusecap.errors import InputError
 from fusecap.evaluate.metrics import correct_limbs, identity_switches, match_people
 from fusecap.geometry.camera import Y_UP_FROM_Z_UP
-from fusecap.sinks.take import Take
+from fusecap.take import Take
 
 RATE_HZ = 25.0
 ACTORS = (0, 1, 2)

@@ -19,10 +19,10 @@ from fusecap.body.shape import BodyShape
 from fusecap.errors import InputError
 from fusecap.evaluate.imu_noise import SimulatedImus
 from fusecap.evaluate.simulator import Person, Progress, Simulation
-from fusecap.sinks.files import safe_name, written_whole
-from fusecap.sinks.take import save_take
+from fusecap.files import safe_name, written_whole
 from fusecap.sources.calibration_files import aniposelib
 from fusecap.sources.toml_text import quoted
+from fusecap.take import save_take
 
 
 def write_session(

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from fusecap.batch.solve import Progress, Solved, solve_instants
 from fusecap.body.prior import PosePrior, load_prior
 from fusecap.evaluate.simulator import Simulation
-from fusecap.offline.solve import Progress, Solved, solve_instants
-from fusecap.scene import Scene, make_sorter
+from fusecap.setup import Scene, make_sorter
 from fusecap.solve.estimator import SubjectModel
 from fusecap.solve.options import SolverOptions
 from fusecap.solve.pose_solver import ImuSites

@@ -33,9 +33,9 @@ from fusecap.evaluate.keypoint_noise import (
 )
 from fusecap.evaluate.rig_noise import RigNoise, believed
 from fusecap.geometry.camera import Camera, Rig
-from fusecap.sinks.take import Take, provenance, take_from_theta
 from fusecap.sources.keypoint_files import KeypointTrack
 from fusecap.sources.synchronizer import people_at
+from fusecap.take import Take, provenance, take_from_theta
 from fusecap.types import Detections, ImuReading
 
 Progress = Callable[[str, int, int], None]

@@ -14,10 +14,10 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from fusecap.detect.detector import Detector
+from fusecap.live.devices.source import SessionClock
 from fusecap.live.health import Meter
 from fusecap.live.incidents import Incidents
 from fusecap.live.latency import CAMERA, DETECTION, WAIT_FOR_DETECTOR, LatencyBook
-from fusecap.live.source import SessionClock
 from fusecap.types import CameraImage, CameraSample
 
 GATHER_NS = 8_000_000

@@ -6,9 +6,9 @@ import os
 import time
 from pathlib import Path
 
-from fusecap.live.source import Delivery
+from fusecap.engine.live_setup import LiveSetup
+from fusecap.live.devices.source import Delivery
 from fusecap.live.status import Light, SourceStatus
-from fusecap.online.setup import LiveSetup
 from fusecap.types import ImuSample
 
 LATE_S = 0.1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 
-from fusecap.live.source import SessionClock
+from fusecap.live.devices.source import SessionClock
 from fusecap.types import CameraSample, Command, ImuSample
 
 Arrival = CameraSample | ImuSample | Command

@@ -5,14 +5,14 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 
+from fusecap.batch.detect import detector_options
 from fusecap.detect.build import build_detector
 from fusecap.detect.detector import Detector
+from fusecap.engine.live_setup import LiveSetup, setup_of
 from fusecap.errors import SessionError
-from fusecap.live.devices import device_sources
-from fusecap.live.playback_sources import PlaybackOptions, playback_sources
-from fusecap.live.source import SessionClock, Source
-from fusecap.offline.detect import detector_options
-from fusecap.online.setup import LiveSetup, setup_of
+from fusecap.live.devices.open_devices import device_sources
+from fusecap.live.devices.playback_sources import PlaybackOptions, playback_sources
+from fusecap.live.devices.source import SessionClock, Source
 from fusecap.sources.live_address import KeypointFolder, parse_camera_address
 from fusecap.sources.session import CameraSettings, Session
 

@@ -7,13 +7,13 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from fusecap.body.shape import REFERENCE_HEIGHT_M, BodyShape
+from fusecap.engine.live_setup import LiveSetup
+from fusecap.live.devices.source import SessionClock
 from fusecap.live.health import Meter
 from fusecap.live.latency import LatencyBook
-from fusecap.live.source import SessionClock
 from fusecap.live.status import StreamStatus
-from fusecap.live.streams import Cast, Stream
-from fusecap.online.setup import LiveSetup
-from fusecap.sinks.streams.person_pose import PersonPose, StreamFrame
+from fusecap.streams.person_pose import PersonPose, StreamFrame
+from fusecap.streams.streams import Cast, Stream
 
 _NEWS_EVERY_NS = 1_000_000_000
 """Between two announcements that a body is now measured otherwise."""

@@ -17,13 +17,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
+from fusecap.engine.live_setup import LiveSetup
+from fusecap.engine.step import LiveStep
 from fusecap.errors import InputError
-from fusecap.live.source import SessionClock
+from fusecap.live.devices.source import SessionClock
 from fusecap.live.status import LiveStatus, RecordingStatus
-from fusecap.online.setup import LiveSetup
-from fusecap.online.setup_json import setup_values
-from fusecap.online.step import LiveStep
-from fusecap.sinks.recording import RecordingWriter
+from fusecap.recording import RecordingWriter
+from fusecap.recording.setup_json import setup_values
 from fusecap.types import CameraImage, CameraSample, Estimate, Event
 
 QUEUE_BYTES = 64 << 20

@@ -22,7 +22,11 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 from fusecap.detect.detector import Detector
+from fusecap.engine.engine import Engine
+from fusecap.engine.live_setup import LiveSetup
+from fusecap.engine.step import LiveStep
 from fusecap.live.detection import DetectionLoop
+from fusecap.live.devices.source import Delivery, SessionClock, Source
 from fusecap.live.feed import Feed
 from fusecap.live.health import Key, ProcessLoad, inputs_of, key_of
 from fusecap.live.inbox import Inbox
@@ -30,11 +34,7 @@ from fusecap.live.incidents import Incidents
 from fusecap.live.latency import CAMERA, SENSOR, LatencyBook
 from fusecap.live.report import LiveReport, subject_reports
 from fusecap.live.solving import LiveEngine, Solving
-from fusecap.live.source import Delivery, SessionClock, Source
 from fusecap.live.status import LiveStatus, RecordingStatus, SourceStatus, StreamStatus
-from fusecap.online.engine import Engine
-from fusecap.online.setup import LiveSetup
-from fusecap.online.step import LiveStep
 from fusecap.types import CameraImage, CameraSample, Command, Event
 
 DELAY_WITH_DETECTOR_S = 0.2

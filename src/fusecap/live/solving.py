@@ -17,6 +17,8 @@ from typing import Protocol
 
 import numpy as np
 
+from fusecap.engine.step import LiveStep
+from fusecap.live.devices.source import SessionClock
 from fusecap.live.health import Meter
 from fusecap.live.inbox import Inbox
 from fusecap.live.latency import (
@@ -26,8 +28,6 @@ from fusecap.live.latency import (
     Arrivals,
     LatencyBook,
 )
-from fusecap.live.source import SessionClock
-from fusecap.online.step import LiveStep
 from fusecap.types import Command, Event, Tick
 
 _EARLY_NS = 1_000_000
@@ -40,7 +40,7 @@ _PEOPLE = 100
 
 
 class LiveEngine(Protocol):
-    """What turns events into poses; holds no clock (`fusecap.online.engine.Engine`)."""
+    """What turns events into poses; holds no clock (`fusecap.engine.engine.Engine`)."""
 
     @property
     def notes(self) -> deque[str]:

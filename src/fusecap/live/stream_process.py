@@ -22,15 +22,15 @@ from contextlib import suppress
 from functools import partial
 from typing import IO
 
+from fusecap.engine.step import LiveStep
 from fusecap.errors import InputError
+from fusecap.live.devices.source import SessionClock
 from fusecap.live.latency import LatencyBook
 from fusecap.live.outputs import StreamOutput
-from fusecap.live.source import SessionClock
 from fusecap.live.status import LiveStatus, StreamStatus
-from fusecap.live.streams import Cast, open_stream
-from fusecap.live.target import Target
-from fusecap.online.step import LiveStep
-from fusecap.sinks.streams.person_pose import pose_of_estimate
+from fusecap.streams.person_pose import pose_of_estimate
+from fusecap.streams.streams import Cast, open_stream
+from fusecap.streams.target import Target
 from fusecap.types import CameraImage, Event
 
 QUEUE = 3

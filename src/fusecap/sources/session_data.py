@@ -18,10 +18,10 @@ from scipy.spatial.transform import Rotation
 
 from fusecap.body.landmarks import LandmarkSet, landmark_set_named
 from fusecap.errors import SessionError
+from fusecap.findings import Finding
 from fusecap.geometry.camera import Rig
 from fusecap.sources.calibration_files import check_rig, load_rig
 from fusecap.sources.detection_files import read_record
-from fusecap.sources.findings import Finding
 from fusecap.sources.imu_files import ImuTrack, read_imu
 from fusecap.sources.keypoint_files import KeypointTrack, read_keypoints
 from fusecap.sources.offset_files import read_offsets

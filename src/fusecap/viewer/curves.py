@@ -10,7 +10,7 @@ import viser
 import viser.uplot
 from jaxtyping import Float
 
-from fusecap.sinks.take import Take
+from fusecap.take import Take
 from fusecap.viewer.palette import Rgb, css
 
 ALL_BONES = "all bones (mean)"

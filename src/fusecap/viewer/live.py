@@ -15,10 +15,10 @@ import numpy as np
 import viser
 from jaxtyping import Float
 
+from fusecap.engine.live_setup import LiveSetup
+from fusecap.engine.step import LiveStep
 from fusecap.live.status import LiveStatus
-from fusecap.live.target import LOOPBACK
-from fusecap.online.setup import LiveSetup
-from fusecap.online.step import LiveStep
+from fusecap.streams.target import LOOPBACK
 from fusecap.types import CameraImage, CameraSample, Command, Event
 from fusecap.viewer import tables
 from fusecap.viewer.commands import CommandPanel

@@ -18,7 +18,7 @@ from viser.infra import WebsockClientConnection
 from websockets.asyncio.server import ServerConnection
 
 from fusecap.errors import InputError
-from fusecap.live.target import LOOPBACK, is_loopback
+from fusecap.streams.target import LOOPBACK, is_loopback
 
 DEFAULT_PORT = 8080
 _PORTS_TRIED = 20

@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from fusecap.body.landmarks import LandmarkSet
+from fusecap.engine.step import LiveStep
+from fusecap.export.overlay import LINKS
 from fusecap.geometry.camera import Camera, Rig
-from fusecap.online.step import LiveStep
-from fusecap.sinks.overlay import LINKS
 from fusecap.types import CameraImage, CameraSample
 from fusecap.viewer.figure import Pose, pose_of
 from fusecap.viewer.palette import Rgb

@@ -8,8 +8,8 @@ from collections.abc import Mapping
 import numpy as np
 import viser
 
-from fusecap.online.setup import LiveSetup
-from fusecap.sources.recording import RecordedEvent, Recording
+from fusecap.engine.live_setup import LiveSetup
+from fusecap.recording.reader import RecordedEvent, Recording
 from fusecap.types import CameraSample
 from fusecap.viewer.figure import Pose
 from fusecap.viewer.floor_plan import FloorDrawing, FloorPlan, standing_places

@@ -9,8 +9,8 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
+from fusecap.engine.step import LiveStep
 from fusecap.live.status import Light, LiveStatus, SourceStatus
-from fusecap.online.step import LiveStep
 from fusecap.types import TrackState
 from fusecap.viewer.palette import Rgb, css, escaped
 

@@ -11,7 +11,7 @@ from viser import GuiEvent
 
 from fusecap.errors import TakeError
 from fusecap.geometry.camera import Rig
-from fusecap.sinks.take import Take
+from fusecap.take import Take
 from fusecap.viewer.controls import PlaybackControls
 from fusecap.viewer.curves import ALL_BONES, Curve, Plot, quality_curve
 from fusecap.viewer.figure import Pose

@@ -34,6 +34,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
+from fusecap.batch.solve import Progress, solve_instants
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.body.pose import forward_kinematics, landmarks_in_world
 from fusecap.calibrate.cameras.people_adjust import (
@@ -52,8 +53,7 @@ from fusecap.errors import InputError
 from fusecap.geometry.camera import Rig
 from fusecap.geometry.similarity import Similarity
 from fusecap.geometry.triangulation import ROBUST_SCALE_PX, triangulate
-from fusecap.offline.solve import Progress, solve_instants
-from fusecap.scene import scene_of
+from fusecap.setup import scene_of
 from fusecap.sources.session_data import SessionData
 from fusecap.types import Detections, ImuReading
 

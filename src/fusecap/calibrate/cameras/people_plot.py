@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from fusecap.calibrate.cameras.people import PeopleCalibration
-from fusecap.sinks.files import written_whole
+from fusecap.files import written_whole
 
 _COLUMNS = 6
 """Cameras in a row of the picture."""

@@ -21,10 +21,10 @@ from jaxtyping import Float, Int
 from fusecap.associate.candidates import CandidateOptions
 from fusecap.associate.subjects import Subject
 from fusecap.associate.tracker import Tracker, TrackerOptions
+from fusecap.batch.solve import Progress
 from fusecap.geometry.camera import Rig
-from fusecap.offline.solve import Progress
 from fusecap.pipeline import Pipeline, observation_of
-from fusecap.scene import scene_of
+from fusecap.setup import scene_of
 from fusecap.sources.session_data import SessionData
 from fusecap.sources.view_agreement import disagreement_px, without_distortion
 from fusecap.types import Detections, TrackState

@@ -17,8 +17,8 @@ from fusecap.calibrate.cameras.board_views import CameraShots
 from fusecap.calibrate.cameras.extrinsics import HeldOut, Repeatability, ScaleCheck, Solution
 from fusecap.calibrate.cameras.intrinsics import Intrinsics, coverage_cells
 from fusecap.errors import CalibrationError
+from fusecap.files import written_whole
 from fusecap.geometry.camera import REFERENCE_WIDTH_PX, Camera
-from fusecap.sinks.files import written_whole
 
 GOOD_PX, POOR_PX = 1.0, 3.0
 """Median held-out error of a corner, in pixels of a 1920-pixel-wide image."""

@@ -32,7 +32,7 @@ from fusecap.body.skeleton import Skeleton
 from fusecap.calibrate.imus.fit import CORRELATION_S, Fit, Pairs, linearised, robust_weights
 from fusecap.calibrate.offsets import SAME_INSTANT_NS, measure_offsets
 from fusecap.geometry.camera import Rig
-from fusecap.sinks.take import Take
+from fusecap.take import Take
 from fusecap.types import Detections
 
 MAX_INSTANTS = 100

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from fusecap.calibrate.imus.motion import SubjectCalibration
-from fusecap.sinks.files import written_whole
+from fusecap.files import written_whole
 
 _COLUMNS = 3
 _TOP_DEG = 40.0

@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.body.skeleton import Skeleton
-from fusecap.sinks.take import Take
+from fusecap.take import Take
 
 LANDMARK_SIGMA_M = 0.02
 """Per axis, of a solved landmark: noise and the constant distance of a detector's landmarks."""

@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from fusecap.batch.solve import Progress, solve_session
 from fusecap.body.landmarks import LANDMARK_SETS
 from fusecap.calibrate.imus.identify import Identity
 from fusecap.calibrate.imus.joint_centres import MAX_INSTANTS, landmarks_seen
@@ -21,8 +22,6 @@ from fusecap.calibrate.imus.motion import (
 from fusecap.calibrate.imus.reference import ReferenceMotion, reference_motion
 from fusecap.calibrate.imus.tpose import TPose, look_at_tpose
 from fusecap.errors import InputError
-from fusecap.offline.solve import Progress, solve_session
-from fusecap.sinks.take import Take
 from fusecap.sources.imu_calibration_files import CalibratedImu
 from fusecap.sources.imu_files.track import ImuTrack
 from fusecap.sources.session import ImuSettings, Session, SubjectSettings
@@ -33,6 +32,7 @@ from fusecap.sources.session_data import (
     session_clocks,
     with_detections,
 )
+from fusecap.take import Take
 from fusecap.types import Detections
 
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from fusecap.calibrate.sync.curves import Curve
 from fusecap.calibrate.sync.session import Row, Synchronisation
-from fusecap.sinks.files import written_whole
+from fusecap.files import written_whole
 
 _CLOSE_UP_S = 3.0
 

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
+from fusecap.batch.solve import solve_session
 from fusecap.calibrate.sync.cameras import CameraClocks, limb_speeds, synchronise_cameras
 from fusecap.calibrate.sync.curves import Curve, Peak
 from fusecap.calibrate.sync.imus import Comparison, Filmed, ImuClock, Worn, unknown_clock
@@ -22,8 +23,6 @@ from fusecap.calibrate.sync.signals import MAX_GAP_S, View, common_smooth_s, vie
 from fusecap.calibrate.sync.stamp import ERROR_S, Stamp, find_stamp
 from fusecap.errors import CalibrationError, InputError
 from fusecap.geometry.camera import Rig
-from fusecap.offline.solve import solve_session
-from fusecap.sinks.take import Take
 from fusecap.sources.imu_files import ImuTrack
 from fusecap.sources.keypoint_files import KeypointTrack
 from fusecap.sources.session import Session, SubjectSettings
@@ -37,6 +36,7 @@ from fusecap.sources.session_data import (
     with_detections,
 )
 from fusecap.sources.sync_files import Clock, Clocks
+from fusecap.take import Take
 
 Progress = Callable[[str, int, int], None]
 

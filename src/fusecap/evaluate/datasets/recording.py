@@ -12,18 +12,18 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from fusecap.batch.solve import Progress, Solved, solve_instants
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.body.pose import landmarks_in_world
 from fusecap.body.prior import load_prior
 from fusecap.body.skeleton import PAPER21, Skeleton
 from fusecap.errors import InputError
 from fusecap.geometry.camera import Rig
-from fusecap.offline.solve import Progress, Solved, solve_instants
-from fusecap.scene import Scene, make_sorter
-from fusecap.sinks.take import Take
+from fusecap.setup import Scene, make_sorter
 from fusecap.solve.estimator import SubjectModel
 from fusecap.solve.options import SolverOptions, Weights
 from fusecap.sources.keypoint_files import read_keypoints
+from fusecap.take import Take
 from fusecap.types import Detections, ImuReading
 
 

@@ -22,8 +22,8 @@ from fusecap.evaluate.metrics import (
     summarize,
 )
 from fusecap.evaluate.tables import Table, Value
-from fusecap.sinks.files import written_whole
-from fusecap.sinks.take import Take
+from fusecap.files import written_whole
+from fusecap.take import Take
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from fusecap.evaluate.score import score_take
 from fusecap.evaluate.tables import Table
-from fusecap.sinks.take import Take
+from fusecap.take import Take
 
 
 def session_table(take: Take, truth: Take, name: str) -> Table:

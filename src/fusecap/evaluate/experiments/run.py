@@ -23,7 +23,7 @@ from fusecap.evaluate.experiments.table4 import TABLE4
 from fusecap.evaluate.experiments.tuning import TUNING
 from fusecap.evaluate.runner import Outcome, Progress, code_version, run_cells
 from fusecap.evaluate.twin import TWIN_VERSION
-from fusecap.sinks.files import written_whole
+from fusecap.files import written_whole
 
 EXPERIMENTS = {
     each.name: each

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from fusecap.findings import Finding
 from fusecap.geometry.camera import Rig
-from fusecap.sources.findings import Finding
 
 MILLIMETRES_ABOVE = 100.0
 """Cameras whose median distance exceeds this are not given in metres."""

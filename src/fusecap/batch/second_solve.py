@@ -1,0 +1,153 @@
+"""The second solve of a live run: the two passes of a session over all that was recorded.
+
+Every sample counts that came at all, however late it came in the run. Who was added in the run is
+expected from the start, and sensors sit as the last T-pose found them; other commands were about
+the run's own tracks and mean nothing here.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from operator import attrgetter
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from fusecap.batch.replay import Replay, loss_notes, recorded_setup
+from fusecap.batch.solve import Progress, Solved, solve_instants
+from fusecap.engine.cameras import Cameras
+from fusecap.engine.sensors import Sensors
+from fusecap.errors import InputError
+from fusecap.recording.reader import RecordedEvent, Recording
+from fusecap.setup import scene_before, sites_of
+from fusecap.sources.session import Session, SubjectSettings
+from fusecap.sources.session_data import MAX_INSTANTS
+from fusecap.types import (
+    CameraSample,
+    Command,
+    CommandKind,
+    Detections,
+    ImuReading,
+    ImuSample,
+    Tick,
+)
+
+AHEAD_NS = 1_000_000_000
+"""Samples so much later than an instant are known to it."""
+
+Sample = CameraSample | ImuSample
+
+
+class RecordedInstants:
+    """The samples of a run, interpolated to instants as the run does it."""
+
+    def __init__(
+        self, session: Session, landmark_count: int, samples: list[Sample], times_ns: list[int]
+    ) -> None:
+        rates_hz = [session.camera_rate_hz(camera) for camera in session.cameras]
+        cameras, sensors = Cameras(rates_hz, landmark_count), Sensors(session.subjects)
+        self._instants: list[tuple[Detections, Mapping[str, ImuReading]]] = []
+        coming = deque(sorted(samples, key=attrgetter("timestamp_ns")))
+        for now_ns in times_ns:
+            while coming and coming[0].timestamp_ns <= now_ns + AHEAD_NS:
+                sample = coming.popleft()
+                if isinstance(sample, CameraSample):
+                    cameras.take(sample)
+                else:
+                    sensors.take(sample)
+            self._instants.append((cameras.detections(now_ns), sensors.readings(now_ns)))
+
+    def __len__(self) -> int:
+        return len(self._instants)
+
+    def detections(self, instant: int) -> Detections:
+        """Everyone in every camera."""
+        return self._instants[instant][0]
+
+    def readings(self, instant: int) -> Mapping[str, ImuReading]:
+        """By subject name, what its sensors say."""
+        return self._instants[instant][1]
+
+
+def solve_recording(recording: Recording, progress: Progress | None = None) -> Solved:
+    """Both passes over a recording; raises `InputError` where it holds no instant."""
+    setup = recorded_setup(recording)
+    samples: list[Sample] = []
+    ticks_ns: list[int] = []
+    commands: list[Command] = []
+    report = progress and (lambda done, total: progress("reading", done, total))
+    for item in recording.items(report):
+        match item:
+            case RecordedEvent(event=Tick() as tick):
+                ticks_ns.append(tick.timestamp_ns)
+            case RecordedEvent(event=Command() as command):
+                commands.append(command)
+            case RecordedEvent(event=CameraSample() | ImuSample() as sample):
+                samples.append(sample)
+    times_ns = _times_ns(recording, ticks_ns, setup.session.settings.rate_hz)
+    notes = loss_notes(recording)
+    session = _with_people(setup.session, commands)
+    if any(command.kind is CommandKind.TPOSE for command in commands):
+        session = _with_mountings(session, _mountings(recording, progress))
+    scene = scene_before(session, setup.rig, setup.landmarks, sites_of(session))
+    return solve_instants(
+        scene,
+        RecordedInstants(session, len(setup.landmarks.landmark_names), samples, times_ns),
+        progress=progress,
+        session_sha256=recording.sha256(),
+        simulated=setup.simulated,
+        notes=notes,
+    )
+
+
+def _times_ns(recording: Recording, ticks_ns: list[int], rate_hz: float) -> list[int]:
+    """The run's own instants, those that it left out filled in."""
+    if not ticks_ns:
+        raise InputError(
+            f"{recording.path} holds no solved instant: it was cut off within the first moments, "
+            "or the run never came to solve"
+        )
+    first, last = (round(ns * 1e-9 * rate_hz) for ns in (min(ticks_ns), max(ticks_ns)))
+    if last - first > MAX_INSTANTS:
+        raise InputError(
+            f"{recording.path}: instants from {min(ticks_ns) * 1e-9:g} to "
+            f"{max(ticks_ns) * 1e-9:g} s at {rate_hz:g} Hz are too many; it is damaged"
+        )
+    return [round(instant * 1e9 / rate_hz) for instant in range(first, last + 1)]
+
+
+def _with_people(session: Session, commands: Sequence[Command]) -> Session:
+    """The session with everyone who was added in the run."""
+    added = [c.subject for c in commands if c.kind is CommandKind.ADD_SUBJECT]
+    known = [subject.name for subject in session.subjects]
+    new = [name for name in dict.fromkeys(added) if name and name not in known]
+    limit = session.settings.max_subjects
+    settings = session.settings.model_copy(
+        update={"max_subjects": None if limit is None else limit + len(added)}
+    )
+    subjects = (*session.subjects, *(SubjectSettings(name=name) for name in new))
+    return session.model_copy(update={"settings": settings, "subjects": subjects})
+
+
+def _mountings(
+    recording: Recording, progress: Progress | None
+) -> Mapping[tuple[str, str], np.ndarray]:
+    """How the sensors sat at the end of the run, by subject and bone."""
+    again = Replay(recording)
+    deque(again.steps(progress), maxlen=0)
+    return again.engine.mountings
+
+
+def _with_mountings(session: Session, mountings: Mapping[tuple[str, str], np.ndarray]) -> Session:
+    subjects = []
+    for subject in session.subjects:
+        imus = []
+        for imu in subject.imus:
+            bone_from_imu = mountings.get((subject.name, imu.bone))
+            if bone_from_imu is not None:
+                x, y, z, w = Rotation.from_matrix(bone_from_imu).as_quat().tolist()
+                imu = imu.model_copy(update={"bone_from_imu_wxyz": (w, x, y, z)})
+            imus.append(imu)
+        subjects.append(subject.model_copy(update={"imus": tuple(imus)}))
+    return session.model_copy(update={"subjects": tuple(subjects)})

@@ -1,0 +1,251 @@
+"""A recorded session to a take, in two passes.
+
+The first pass sorts and solves every instant as a live run would, and learns the bodies of people
+nobody measured. The second solves each subject again from the keypoints it was assigned, with one
+body throughout, and from the instant it was first seen rather than the one it was confirmed at.
+
+Interrupted (Ctrl-C), either pass ends at the instant it had reached and the take holds what was
+solved.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from fusecap.body.shape import BodyShape
+from fusecap.pipeline import Pipeline, observation_of
+from fusecap.setup import Instants, Scene, SessionInstants, scene_of
+from fusecap.solve.reprojection import Reprojection
+from fusecap.sources.session_data import SessionData
+from fusecap.take import Take, TakeBuilder, provenance
+from fusecap.types import Detections, Estimate, ImuReading, TrackState, TrackUpdate
+
+Progress = Callable[[str, int, int], None]
+"""Called with (what is being done, instants done, instants in all)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolveReport:
+    """What a solve can say about itself; `as_json` is the `--json` output."""
+
+    instants: int
+    duration_s: float
+    cameras: int
+    subjects: dict[str, dict[str, float]]
+    """Per subject: tracked_share (of all instants), mean_quality (0-1), height_m."""
+    reprojection_px: dict[str, dict[str, float]]
+    """Per camera, in its own pixels: median, p90, and how many keypoints were used."""
+    solve_ms_median: float
+    solve_ms_p99: float
+    solves: int
+    statuses: dict[str, int]
+    elapsed_s: float
+    interrupted: bool
+    notes: tuple[str, ...] = ()
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values; NaN becomes None."""
+        return _without_nan(asdict(self))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Solved:
+    """A take and how it came about."""
+
+    take: Take
+    report: SolveReport
+
+
+def solve_session(data: SessionData, *, progress: Progress | None = None) -> Solved:
+    """Solve an opened session; raises `SessionError` where nothing can be solved."""
+    scene = scene_of(data)
+    return solve_instants(
+        scene,
+        SessionInstants(data),
+        progress=progress,
+        session_sha256=data.content_hash,
+        notes=tuple(str(finding) for finding in data.findings),
+    )
+
+
+def solve_instants(
+    scene: Scene,
+    instants: Instants,
+    *,
+    progress: Progress | None = None,
+    session_sha256: str | None = None,
+    simulated: bool = False,
+    notes: tuple[str, ...] = (),
+) -> Solved:
+    """Both passes over recorded instants."""
+    started = time.perf_counter()
+    pipeline = Pipeline(
+        rig=scene.rig,
+        landmarks=scene.landmarks,
+        skeleton=scene.skeleton,
+        prior=scene.prior,
+        sorter=scene.sorter,
+        subjects=scene.subjects,
+        options=scene.options,
+    )
+    tracked = _first_pass(pipeline, instants, progress)
+    reprojection = Reprojection(scene.rig, scene.landmarks)
+    builder = TakeBuilder(
+        skeleton=scene.skeleton,
+        rate_hz=scene.rate_hz,
+        subject_names=_in_order([model.name for model in scene.subjects], tracked.shapes),
+        provenance=provenance(
+            options={"solver": asdict(scene.options), "cameras": list(scene.rig.names)},
+            session_sha256=session_sha256,
+            simulated=simulated,
+        ),
+    )
+    second = _SecondPass(scene, pipeline, tracked)
+    solve_s, statuses = [], Counter()
+    interrupted = tracked.interrupted
+    try:
+        for instant, updates in enumerate(tracked.updates):
+            detections = instants.detections(instant)
+            estimates = second.step(detections, instants.readings(instant), updates)
+            builder.add(detections.timestamp_ns, [estimate for estimate, _ in estimates])
+            for estimate, keypoints in estimates:
+                reprojection.add(estimate, keypoints)
+                solve_s.append(estimate.solve_s)
+                statuses[estimate.status.name.lower()] += 1
+            if progress:
+                progress("solving", instant + 1, len(tracked.updates))
+    except KeyboardInterrupt:
+        interrupted = True
+    take = builder.build()
+    solve_ms = np.array(solve_s or [np.nan]) * 1e3
+    return Solved(
+        take=take,
+        report=SolveReport(
+            instants=len(take.timestamps_ns),
+            duration_s=len(take.timestamps_ns) / scene.rate_hz,
+            cameras=len(scene.rig),
+            subjects=describe_subjects(take),
+            reprojection_px=reprojection.summary(),
+            solve_ms_median=float(np.median(solve_ms)),
+            solve_ms_p99=float(np.percentile(solve_ms, 99)),
+            solves=len(solve_s),
+            statuses=dict(statuses),
+            elapsed_s=time.perf_counter() - started,
+            interrupted=interrupted,
+            notes=notes,
+        ),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Tracked:
+    """What the first pass leaves: per instant the updates of people who became subjects."""
+
+    updates: list[list[TrackUpdate]]
+    shapes: dict[str, BodyShape]
+    interrupted: bool
+
+
+def _in_order(named: list[str], found: Collection[str]) -> list[str]:
+    """Named subjects as the session lists them, then person1, person2, ... person10."""
+    return named + sorted(set(found) - set(named), key=lambda name: (len(name), name))
+
+
+def _first_pass(pipeline: Pipeline, instants: Instants, progress: Progress | None) -> _Tracked:
+    updates: list[tuple[TrackUpdate, ...]] = []
+    names: dict[int, str] = {}
+    interrupted = False
+    try:
+        for instant in range(len(instants)):
+            step = pipeline.step(instants.detections(instant), instants.readings(instant))
+            updates.append(step.updates)
+            for update in step.updates:
+                if update.state is not TrackState.TENTATIVE:
+                    names[update.track_id] = update.name
+            if progress:
+                progress("sorting", instant + 1, len(instants))
+    except KeyboardInterrupt:
+        interrupted = True
+    return _Tracked(
+        updates=[_named(some, names) for some in updates],
+        shapes={name: pipeline.estimator(name).shape for name in set(names.values())},
+        interrupted=interrupted,
+    )
+
+
+def _named(updates: tuple[TrackUpdate, ...], names: Mapping[int, str]) -> list[TrackUpdate]:
+    """Updates of tracks that were confirmed sooner or later, under the subject's name."""
+    taken: dict[str, TrackUpdate] = {}
+    for update in updates:
+        name = names.get(update.track_id)
+        if name is None or (update.state is TrackState.TENTATIVE and name in taken):
+            continue
+        taken[name] = TrackUpdate(
+            track_id=update.track_id,
+            name=name,
+            state=update.state,
+            person=update.person,
+            landmarks_in_world_m=update.landmarks_in_world_m,
+        )
+    return list(taken.values())
+
+
+class _SecondPass:
+    """Solves people from assignments that stand."""
+
+    def __init__(self, scene: Scene, pipeline: Pipeline, tracked: _Tracked) -> None:
+        self._landmark_count = len(scene.landmarks.landmark_names)
+        self._estimators = {}
+        for name, shape in tracked.shapes.items():
+            estimator = pipeline.make_estimator(pipeline.model(name))
+            estimator.set_shape(shape)
+            self._estimators[name] = estimator
+
+    def step(
+        self,
+        detections: Detections,
+        readings: Mapping[str, ImuReading],
+        updates: Sequence[TrackUpdate],
+    ) -> list[tuple[Estimate, np.ndarray]]:
+        """Estimates, each with the keypoints (C, K, 3) it was solved from."""
+
+        def solve(update: TrackUpdate) -> tuple[Estimate, np.ndarray] | None:
+            estimator = self._estimators[update.name]
+            observation = observation_of(
+                update, detections, self._landmark_count, readings.get(update.name)
+            )
+            estimate = estimator.follow(update.track_id, observation, update.landmarks_in_world_m)
+            return estimate and (estimate, observation.keypoints)
+
+        return [solved for solved in map(solve, updates) if solved]
+
+
+def describe_subjects(take: Take) -> dict[str, dict[str, float]]:
+    """As `SolveReport.subjects`."""
+    return {name: _describe(take, s) for s, name in enumerate(take.subject_names)}
+
+
+def _describe(take: Take, subject: int) -> dict[str, float]:
+    tracked = take.tracked[subject]
+    quality = take.bone_quality[subject][tracked]
+    return {
+        "tracked_share": float(tracked.mean()) if tracked.size else 0.0,
+        "mean_quality": float(quality.mean()) if quality.size else 0.0,
+        "height_m": float(take.heights_m[subject]),
+    }
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_nan(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(item) for item in value]
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value

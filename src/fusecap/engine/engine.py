@@ -1,0 +1,187 @@
+"""Events in, poses out: everything of a live run that decides poses.
+
+    CameraSample ─▶ Cameras ──Detections──┐
+                                          ├─▶ Pipeline ─▶ Continuity ─▶ LiveStep
+       ImuSample ─▶ Sensors ──ImuReading──┘
+
+A `Tick` solves one instant with the samples that have come so far; nothing here knows what time it
+is. So an event sequence determines every pose, bit for bit, whenever and on whatever machine it is
+played back.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from fusecap.engine.cameras import Cameras
+from fusecap.engine.continuity import Continuity
+from fusecap.engine.expected import expected_people
+from fusecap.engine.live_setup import LiveSetup
+from fusecap.engine.sensors import Sensors
+from fusecap.engine.step import LiveStep
+from fusecap.errors import SessionError
+from fusecap.pipeline import Pipeline, Step
+from fusecap.setup import scene_before, sites_of
+from fusecap.types import CameraSample, Command, CommandKind, Detections, Event, ImuSample
+
+LOST_S = 1.0
+"""Without any measurement before a person is said to be lost."""
+
+
+class Engine:
+    """One live run; owned by one thread."""
+
+    def __init__(self, setup: LiveSetup) -> None:
+        session = setup.session
+        scene = scene_before(session, setup.rig, setup.landmarks, sites_of(session))
+        self.notes: deque[str] = deque(maxlen=100)
+        """What happened, in words, oldest first; the runtime takes them out."""
+        self._cameras = Cameras(
+            [session.camera_rate_hz(camera) for camera in session.cameras],
+            len(setup.landmarks.landmark_names),
+        )
+        self._sensors = Sensors(session.subjects)
+        self._pipeline = Pipeline(
+            rig=scene.rig,
+            landmarks=scene.landmarks,
+            skeleton=scene.skeleton,
+            prior=scene.prior,
+            sorter=scene.sorter,
+            subjects=scene.subjects,
+            options=scene.options,
+        )
+        self._rig = setup.rig
+        self._hold_s = session.live.hold_s
+        self._people = {subject.name: Continuity(self._hold_s) for subject in session.subjects}
+        """In a lasting order."""
+        self._tpose_facing_rad = {
+            subject.name: float(np.radians(subject.tpose_facing_deg))
+            for subject in session.subjects
+        }
+        self._present: set[str] = set()
+        self._seen: set[str] = set()
+        self._step = Step(updates=(), estimates=())
+        nobody = np.empty((0, len(setup.landmarks.landmark_names), 3))
+        self._detections = Detections(timestamp_ns=0, people=(nobody,) * len(setup.rig))
+        self._last_ns: int | None = None
+
+    def take(self, event: Event) -> LiveStep | None:
+        """A step for a tick, else None; also for a tick that is not after the last one."""
+        if isinstance(event, CameraSample):
+            self._cameras.take(event)
+        elif isinstance(event, ImuSample):
+            self._sensors.take(event)
+        elif isinstance(event, Command):
+            self._obey(event)
+        elif self._last_ns is None or event.timestamp_ns > self._last_ns:
+            self._last_ns = event.timestamp_ns
+            return self._solve(event.timestamp_ns)
+        return None
+
+    def ready(self, timestamp_ns: int) -> bool:
+        """Whether every fresh source has a sample at or after an instant; not without any."""
+        waiting = [*self._cameras.waiting(timestamp_ns), *self._sensors.waiting(timestamp_ns)]
+        return bool(waiting) and not any(waiting)
+
+    def expected(self, timestamp_ns: int) -> list[np.ndarray]:
+        """Per camera (m, k, 3) people expected at an instant: x, y [px], confidence."""
+        return expected_people(
+            self._rig, self._pipeline, self._step, self._detections.people, timestamp_ns
+        )
+
+    @property
+    def mountings(self) -> dict[tuple[str, str], np.ndarray]:
+        """R_ib (3, 3) by subject and bone, as stated or taken from a T-pose."""
+        return self._sensors.mountings
+
+    def unused(self) -> dict[str, int]:
+        """By camera, and by "subject/bone", how many samples came twice, too late or too early."""
+        cameras = zip(self._rig.names, self._cameras.unused(), strict=True)
+        return {**dict(cameras), **self._sensors.unused()}
+
+    def _solve(self, now_ns: int) -> LiveStep:
+        detections = self._cameras.detections(now_ns)
+        readings = self._sensors.readings(now_ns)
+        step = self._pipeline.step(detections, readings)
+        solved = {estimate.name: estimate for estimate in step.estimates}
+        for name in solved:
+            if name not in self._people:
+                self._people[name] = Continuity(self._hold_s)
+        people = {}
+        for name, continuity in self._people.items():
+            estimate = solved.get(name)
+            views = 0 if estimate is None else min(int(estimate.views.sum()), 2)
+            silent_ns = now_ns - (continuity.measured_ns or now_ns)
+            people[name] = continuity.update(estimate, (views, name in readings), now_ns)
+            self._watch(name, continuity.measured_ns == now_ns, silent_ns * 1e-9)
+        self._detections, self._step = detections, step
+        return LiveStep(
+            timestamp_ns=now_ns,
+            detections=detections,
+            readings=readings,
+            step=step,
+            people=people,
+        )
+
+    def _watch(self, name: str, measured: bool, silent_s: float) -> None:
+        """Notes of people who come, go and return."""
+        if measured and name not in self._present:
+            was_here = name in self._seen
+            self.notes.append(f"{name} returned" if was_here else f"{name} found")
+            self._present.add(name)
+            self._seen.add(name)
+        elif not measured and silent_s > LOST_S and name in self._present:
+            self.notes.append(f"{name} lost: no camera sees them, no sensor is heard")
+            self._present.remove(name)
+
+    def _obey(self, command: Command) -> None:
+        name, adds = command.subject, command.kind is CommandKind.ADD_SUBJECT
+        if name and adds == (name in self._people):
+            found = "somebody is" if adds else "nobody is"
+            self.notes.append(f"{command.kind.value} ignored: {found} called '{name}'")
+            return
+        try:
+            if adds:
+                self._add(name)
+            elif command.kind is CommandKind.REINITIALISE:
+                self._pipeline.reinitialise(name)
+                self.notes.append(f"{name or 'everyone'} to be found anew")
+            elif command.kind is CommandKind.REMOVE_SUBJECT:
+                self._remove(name)
+            else:
+                self._mount(name)
+        except SessionError as error:
+            self.notes.append(f"{command.kind.value} not done: {error}")
+
+    def _add(self, name: str) -> None:
+        self._pipeline.add_subject(name)
+        self.notes.append(f"room for {name or 'one more person'}")
+        if name:
+            self._people[name] = Continuity(self._hold_s)
+
+    def _remove(self, name: str) -> None:
+        if not name:
+            raise SessionError("say whom")
+        self._pipeline.remove_subject(name)
+        self.notes.append(f"{name} removed")
+        del self._people[name]
+        self._present.discard(name)
+        self._seen.discard(name)
+
+    def _mount(self, name: str) -> None:
+        wearers = [name] if name else [n for n in self._sensors.wearers if n in self._people]
+        for wearer in wearers:
+            if wearer not in self._sensors.wearers:
+                self.notes.append(f"{wearer} wears no sensors: no T-pose taken")
+            else:
+                self.notes.append(self._sensors.mount_in_tpose(wearer, self._facing_rad(wearer)))
+
+    def _facing_rad(self, name: str) -> float:
+        """Where a subject faces now: as cameras saw it, else as the session says for the T-pose."""
+        for estimate in self._step.estimates:
+            if estimate.name == name and estimate.views.sum() > 1:
+                ahead = estimate.bone_rotation_in_world[0, :, 2]
+                return float(np.arctan2(ahead[0], ahead[2]))
+        return self._tpose_facing_rad[name]

@@ -1,0 +1,65 @@
+"""Keypoints as OpenPose JSON: a folder per camera, a file per frame.
+
+    left_000000000012_keypoints.json
+    {"version": 1.3, "people": [{"person_id": [-1], "pose_keypoints_2d": [x, y, c, ...]}, ...]}
+
+x, y in pixels, c 0-1; a missing keypoint is 0, 0, 0. A frame's file takes its name only once it is
+whole, so a folder is valid whenever the writer dies; `detection.json` beside the frames
+(docs/formats.md) says what they were made from.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from fusecap.errors import InputError
+from fusecap.files import safe_name, written_whole
+
+RECORD_NAME = "detection.json"
+_OURS = re.compile(r".*_\d{12}_keypoints\.json|\..*\.part")
+
+
+def frame_path(folder: Path, camera: str, number: int) -> Path:
+    """Where a frame's keypoints go."""
+    return folder / f"{safe_name(camera)}_{number:012d}_keypoints.json"
+
+
+def write_frame(folder: Path, camera: str, number: int, people: Float[np.ndarray, "n k 3"]) -> None:
+    """Writes one frame, whole or not at all; raises `InputError` with the system's reason."""
+    values = np.where(people[:, :, 2:] > 0, people, 0.0)
+    values = np.concatenate([values[:, :, :2].round(3), values[:, :, 2:].round(5)], axis=2)
+    entries = [
+        {"person_id": [-1], "pose_keypoints_2d": person.ravel().tolist()} for person in values
+    ]
+    path = frame_path(folder, camera, number)
+    part = path.with_name(f".{path.name}.part")
+    try:
+        part.write_text(json.dumps({"version": 1.3, "people": entries}), encoding="utf-8")
+        os.replace(part, path)
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {error.strerror or error}") from error
+
+
+def write_record(folder: Path, text: str) -> None:
+    """Writes `detection.json`."""
+    with written_whole(folder / RECORD_NAME) as file:
+        file.write(text.encode())
+
+
+def is_foreign(folder: Path) -> bool:
+    """Whether a folder without a record holds anything but what a killed writer left."""
+    return folder.is_dir() and any(not path.name.endswith(".part") for path in folder.iterdir())
+
+
+def clear(folder: Path) -> None:
+    """Deletes the frames of an earlier detection, then its record."""
+    for path in folder.iterdir():
+        if _OURS.fullmatch(path.name):
+            path.unlink()
+    (folder / RECORD_NAME).unlink(missing_ok=True)

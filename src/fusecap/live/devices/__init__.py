@@ -1,0 +1,1 @@
+"""What a live run is plugged into: cameras, sensors, and their playback."""

@@ -1,0 +1,198 @@
+"""A recorded session, delivered as if it were live: every camera and sensor at its own pace.
+
+A loop jumps back to where people began, though never in time. `there_and_back` plays every second
+round backwards instead: nobody jumps, and sensors stay true, because neither orientation nor
+acceleration depends on the direction of time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from fusecap.errors import InputError, SessionError
+from fusecap.live.devices.faults import Fault, FaultKind, with_faults
+from fusecap.live.devices.paced_sources import (
+    HeldPictures,
+    Keypoints,
+    PacedSource,
+    Pictures,
+    Schedule,
+    Sensors,
+)
+from fusecap.live.devices.source import SessionClock, Source
+from fusecap.sources.keypoint_files import read_keypoints
+from fusecap.sources.session import CameraSettings, Session
+from fusecap.sources.session_data import common_landmarks, open_imus, session_clocks
+from fusecap.sources.video import Video
+
+Progress = Callable[[str, int, int], None]
+"""Called with (what is being read, done, total)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Stall:
+    """A source that delivers nothing for a while."""
+
+    source: str
+    """A camera's name, "subject/bone", or a subject's name for all of its sensors."""
+    start_s: float
+    """Since the run began."""
+    length_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlaybackOptions:
+    """How a recording is played."""
+
+    loop: bool = False
+    """Play again from the start without end, with a jump of the people."""
+    there_and_back: bool = False
+    """Play backwards and forwards without end; pictures must be `in_memory`."""
+    in_memory: bool = False
+    """Decode all pictures before the run."""
+    image_rate_hz: float | None = None
+    """Leave out pictures beyond this rate; None: play all."""
+    delay_s: float = 0.0
+    """From exposure to arrival."""
+    jitter_ms: float = 0.0
+    """Further delay, uniform between 0 and this."""
+    loss: float = 0.0
+    """Share of samples and pictures that never arrive."""
+    stalls: tuple[Stall, ...] = ()
+    seed: int = 0
+
+
+def playback_sources(
+    session: Session,
+    clock: SessionClock,
+    options: PlaybackOptions | None = None,
+    progress: Progress | None = None,
+) -> list[Source]:
+    """A source per camera, and one per subject with sensors; files are read before this returns.
+
+    A camera with keypoints delivers these, one with a video only its pictures. Raises `InputError`
+    for inputs that cannot be read, and for cameras and sensors without any.
+    """
+    options = options or PlaybackOptions()
+    _check(options)
+    sources = [
+        *_cameras(session, options, progress),
+        *_sensors(session),
+    ]
+    schedule = Schedule(
+        sources,
+        clock,
+        loop=options.loop or options.there_and_back,
+        two_way=options.there_and_back,
+        delay_ns=round(options.delay_s * 1e9),
+        jitter_ns=round(options.jitter_ms * 1e6),
+    )
+    for index, source in enumerate(sources):
+        source.follow(schedule, seed=options.seed + index)
+    faults = _faults(options, session)
+    return with_faults(sources, faults, clock, options.seed) if faults else list(sources)
+
+
+def _faults(options: PlaybackOptions, session: Session) -> list[Fault]:
+    where = {camera.name: f"camera '{camera.name}'" for camera in session.cameras}
+    for subject in session.subjects:
+        where[subject.name] = f"imus of '{subject.name}'"
+        where |= {sensor: sensor for sensor in (f"{subject.name}/{i.bone}" for i in subject.imus)}
+    faults = []
+    for stall in options.stalls:
+        if stall.source not in where:
+            raise InputError(
+                f"no source '{stall.source}' to stall; expected one of {', '.join(where)}"
+            )
+        faults.append(
+            Fault(
+                kind=FaultKind.STALL,
+                where=where[stall.source],
+                start_s=stall.start_s,
+                length_s=stall.length_s,
+            )
+        )
+    if options.loss:
+        faults.append(Fault(kind=FaultKind.LOSS, amount=options.loss))
+    return faults
+
+
+def _check(options: PlaybackOptions) -> None:
+    if not 0 <= options.loss <= 1:
+        raise InputError(f"loss is {options.loss:g}, expected a share from 0 to 1")
+    if options.jitter_ms < 0 or options.delay_s < 0:
+        raise InputError("delay and jitter of a playback must be zero or more")
+    if options.image_rate_hz is not None and options.image_rate_hz <= 0:
+        raise InputError(f"image rate {options.image_rate_hz:g}, expected a number above zero")
+
+
+def _cameras(
+    session: Session, options: PlaybackOptions, progress: Progress | None
+) -> Iterator[PacedSource]:
+    landmarks = common_landmarks(session)
+    clocks = session_clocks(session)
+    for index, camera in enumerate(session.cameras):
+        report = None if progress is None else partial(progress, f"camera '{camera.name}'")
+        clock = clocks.camera(camera.name)
+        if camera.keypoints is not None and landmarks is not None:
+            track = read_keypoints(
+                camera.keypoints,
+                name=camera.name,
+                landmarks=landmarks,
+                rate_hz=session.camera_rate_hz(camera),
+                offset_s=camera.offset_s,
+                own_times=camera.rate_hz is None,
+                progress=report,
+            )
+            yield Keypoints(index, track, clock.session_s(track.times_s))
+        elif camera.video is not None:
+            video = Video(camera.video)
+            times_s = clock.session_s(_exposed_s(video, camera))
+            shown = _thinned(times_s, options.image_rate_hz)
+            if options.in_memory:
+                yield HeldPictures(index, camera.name, video, times_s, shown, report)
+            elif options.there_and_back:
+                raise InputError(
+                    f"camera '{camera.name}': a video is played backwards only from memory; "
+                    "decode it before the run (in_memory)"
+                )
+            else:
+                yield Pictures(index, camera.name, video, times_s, shown)
+        else:
+            raise SessionError(
+                f"{session.path}: camera '{camera.name}' is live only; name a folder of keypoints "
+                "or a video to play back"
+            )
+
+
+def _sensors(session: Session) -> Iterator[PacedSource]:
+    clocks = session_clocks(session)
+    for subject in session.subjects:
+        if subject.imus:
+            bones = [imu.bone for imu in subject.imus]
+            tracks = open_imus(subject)
+            times_s = [
+                clocks.imu(subject.name, bone).session_s(track.times_s)
+                for bone, track in zip(bones, tracks, strict=True)
+            ]
+            yield Sensors(subject.name, bones, tracks, times_s)
+
+
+def _exposed_s(video: Video, camera: CameraSettings) -> Float[np.ndarray, " f"]:
+    """On the camera's clock; a constant rate without the container's rounding."""
+    if camera.rate_hz is None and video.info.is_variable_rate:
+        return video.times_ns * 1e-9 + camera.offset_s
+    return np.arange(video.info.frames) / (camera.rate_hz or video.info.rate_hz) + camera.offset_s
+
+
+def _thinned(times_s: Float[np.ndarray, " f"], rate_hz: float | None) -> Int[np.ndarray, " n"]:
+    """Which frames to show so that there are at most `rate_hz` per second."""
+    if rate_hz is None:
+        return np.arange(len(times_s))
+    slot = np.floor((times_s - times_s[0]) * rate_hz + 1e-6)
+    return np.flatnonzero(np.diff(slot, prepend=-1.0) > 0)

@@ -1,0 +1,1 @@
+"""Recorded motion: its files, onto our skeleton, and what is trained on it."""

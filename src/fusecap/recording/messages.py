@@ -1,0 +1,143 @@
+"""One JSON message per sample, command, tick and pose, and the JSON schemas that describe them.
+
+Numbers are written in the shortest form that reads back to the same bits; missing ones are null.
+Positions and rotations of poses follow from theta and are rounded to 1 um and 1e-7.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+
+from fusecap.body.shape import BodyShape
+from fusecap.streams.person_pose import xyzw_from_matrix
+from fusecap.types import CameraSample, Command, Estimate, ImuSample, Tick
+
+
+def keypoints_message(sample: CameraSample) -> str:
+    return (
+        f'{{"camera":{sample.camera},"timestamp_ns":{sample.timestamp_ns},'
+        f'"people":{_numbers(sample.people)}}}'
+    )
+
+
+def imu_message(sample: ImuSample) -> str:
+    return (
+        f'{{"subject":{json.dumps(sample.subject)},"bone":{json.dumps(sample.bone)},'
+        f'"timestamp_ns":{sample.timestamp_ns},'
+        f'"orientation_wxyz":{_numbers(sample.orientation_wxyz)},'
+        f'"accel_m_s2":{_numbers(sample.accel_m_s2)}}}'
+    )
+
+
+def command_message(command: Command) -> str:
+    return json.dumps({"kind": command.kind.value, "subject": command.subject})
+
+
+def tick_message(tick: Tick) -> str:
+    return f'{{"timestamp_ns":{tick.timestamp_ns}}}'
+
+
+def pose_message(estimate: Estimate) -> str:
+    xyzw = xyzw_from_matrix(estimate.bone_rotation_in_world)
+    return (
+        f'{{"name":{json.dumps(estimate.name)},"track_id":{estimate.track_id},'
+        f'"timestamp_ns":{estimate.timestamp_ns},"status":"{estimate.status.name.lower()}",'
+        f'"iterations":{estimate.iterations},"cost":{_numbers(np.float64(estimate.cost))},'
+        f'"solve_s":{_numbers(np.float64(estimate.solve_s))},'
+        f'"views":{json.dumps(estimate.views.tolist())},'
+        f'"theta":{_numbers(estimate.theta)},"bone_quality":{_numbers(estimate.bone_quality)},'
+        f'"position_m":{_numbers(np.round(estimate.bone_position_in_world_m, 6))},'
+        f'"rotation_wxyz":{_numbers(np.round(np.roll(xyzw, 1, axis=1), 7))}}}'
+    )
+
+
+def body_message(name: str, shape: BodyShape) -> str:
+    skeleton = shape.skeleton
+    return (
+        f'{{"name":{json.dumps(name)},"height_m":{_numbers(np.float64(shape.height_m))},'
+        f'"bone_names":{json.dumps(skeleton.bone_names)},'
+        f'"parents":{json.dumps(skeleton.parents)},"offsets_m":{_numbers(shape.offsets_m)}}}'
+    )
+
+
+def _numbers(values: np.ndarray | np.float64) -> str:
+    # Python writes numbers as JSON does, but for two that JSON lacks; 1e999 is in its grammar, and
+    # every reader takes it for infinity.
+    return str(values.tolist()).replace("nan", "null").replace("inf", "1e999")
+
+
+def _object(title: str, description: str, **properties: Any) -> dict[str, Any]:
+    return {
+        "title": title,
+        "description": description,
+        "type": "object",
+        "properties": properties,
+        "required": list(properties),
+    }
+
+
+def _list(items: dict[str, Any], description: str) -> dict[str, Any]:
+    return {"type": "array", "items": items, "description": description}
+
+
+_NUMBER = {"type": ["number", "null"]}
+_ROW = {"type": "array", "items": _NUMBER}
+_TEXT = {"type": "string"}
+_TIME = {"type": "integer", "description": "Of the sample, ns on the session's clock."}
+
+SCHEMAS = {
+    schema["title"]: schema
+    for schema in (
+        _object(
+            "fusecap.Keypoints",
+            "Everyone the detector found in one picture of one camera.",
+            camera={"type": "integer", "description": "In the order of the rig."},
+            timestamp_ns=_TIME,
+            people=_list(_list(_ROW, "x [px], y [px], confidence 0-1"), "Per person, per keypoint"),
+        ),
+        _object(
+            "fusecap.Imu",
+            "What one sensor measured at one moment.",
+            subject=_TEXT,
+            bone=_TEXT,
+            timestamp_ns=_TIME,
+            orientation_wxyz=_list(_NUMBER, "imu_world_from_imu, unit quaternion"),
+            accel_m_s2=_list(_NUMBER, "Specific force in the imu frame"),
+        ),
+        _object(
+            "fusecap.Command",
+            "A user's wish, in its place among the samples.",
+            kind=_TEXT,
+            subject=_TEXT,
+        ),
+        _object("fusecap.Tick", "Solve this instant now.", timestamp_ns=_TIME),
+        _object(
+            "fusecap.Pose",
+            "One person as solved and sent; world right-handed, y up, floor y = 0.",
+            name=_TEXT,
+            track_id={"type": "integer"},
+            timestamp_ns=_TIME,
+            status=_TEXT,
+            iterations={"type": "integer"},
+            cost=_NUMBER,
+            solve_s=_NUMBER,
+            views=_list({"type": "boolean"}, "Which cameras contributed"),
+            theta=_list(_NUMBER, "Root translation [m], then an angle-axis vector [rad] per bone"),
+            bone_quality=_list(_NUMBER, "0-1"),
+            position_m=_list(_ROW, "Per bone, the joint at its root"),
+            rotation_wxyz=_list(_ROW, "Per bone, world_from_bone"),
+        ),
+        _object(
+            "fusecap.Body",
+            "A person's body from now on.",
+            name=_TEXT,
+            height_m=_NUMBER,
+            bone_names=_list(_TEXT, "Bones in order"),
+            parents=_list({"type": "integer"}, "-1 for the root"),
+            offsets_m=_list(_ROW, "Each joint in its parent's bone frame"),
+        ),
+    )
+}

@@ -1,8 +1,0 @@
-"""A live run as one MCAP log: every sample, command and tick in order, and what became of them.
-
-docs/recording.md has the layout.
-"""
-
-from fusecap.sinks.recording.writer import FORMAT, RecordingWriter
-
-__all__ = ["FORMAT", "RecordingWriter"]

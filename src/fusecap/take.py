@@ -1,0 +1,356 @@
+"""A take: the solved motion of every subject over one session, in memory and as one `.npz`.
+
+    S subjects, T frames, B bones; world right-handed, y up, metres; see docs/take.md
+
+The poses are stored twice, as `theta` and as world positions and rotations, so that a reader needs
+no forward kinematics. NaN stands only where `tracked` is false.
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+import zlib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.lib.npyio import NpzFile
+from scipy.spatial.transform import Rotation
+
+from fusecap.body.pose import forward_kinematics
+from fusecap.body.shape import REFERENCE_HEIGHT_M, BodyShape
+from fusecap.body.skeleton import Skeleton
+from fusecap.errors import TakeError, nearest
+from fusecap.files import written_whole
+from fusecap.types import Estimate, Status
+
+FORMAT_VERSION = 1
+_FORMAT = f"fusecap take {FORMAT_VERSION}"
+
+UNITS = {
+    "timestamps_ns": "ns, one clock",
+    "rate_hz": "Hz",
+    "heights_m": "m",
+    "offsets_m": "m, joint in its parent's bone frame",
+    "theta": "m, then rad: root translation in world, then one angle-axis vector per bone, "
+    "local to its parent",
+    "bone_position_in_world_m": "m, the joint at the bone's root",
+    "bone_rotation_in_world_wxyz": "unit quaternion world_from_bone, w >= 0",
+    "bone_quality": "0-1",
+    "world": "right-handed, y up, floor at y = 0",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Take:
+    """The motion of S subjects over T frames; raises `TakeError` where the parts disagree."""
+
+    timestamps_ns: Int[np.ndarray, " t"]
+    rate_hz: float
+    subject_names: tuple[str, ...]
+    skeleton_name: str
+    bone_names: tuple[str, ...]
+    parents: tuple[int, ...]
+    heights_m: Float[np.ndarray, " s"]
+    offsets_m: Float[np.ndarray, "s b 3"]
+    theta: Float[np.ndarray, "s t p"]
+    bone_position_in_world_m: Float[np.ndarray, "s t b 3"]
+    bone_rotation_in_world_wxyz: Float[np.ndarray, "s t b 4"]
+    tracked: Bool[np.ndarray, "s t"]
+    bone_quality: Float[np.ndarray, "s t b"]
+    """0-1; 0 where the pose is the prior's guess."""
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+    """What made it: see `provenance`."""
+
+    def __post_init__(self) -> None:
+        s, t, b = len(self.subject_names), len(self.timestamps_ns), len(self.bone_names)
+        for name, shape in {
+            "timestamps_ns": (t,),
+            "parents": (b,),
+            "heights_m": (s,),
+            "offsets_m": (s, b, 3),
+            "theta": (s, t, 3 + 3 * b),
+            "bone_position_in_world_m": (s, t, b, 3),
+            "bone_rotation_in_world_wxyz": (s, t, b, 4),
+            "tracked": (s, t),
+            "bone_quality": (s, t, b),
+        }.items():
+            found = np.shape(getattr(self, name))
+            if found != shape:
+                raise TakeError(
+                    f"{name} is {found}, expected {shape} for {s} subjects, {t} frames, {b} bones"
+                )
+        if len(set(self.subject_names)) != s:
+            raise TakeError(f"two subjects of the take share a name: {self.subject_names}")
+        if not (np.isfinite(self.rate_hz) and self.rate_hz > 0):
+            raise TakeError(f"rate_hz is {self.rate_hz}, expected a positive number")
+        if t > 1 and np.diff(self.timestamps_ns).min() <= 0:
+            raise TakeError("timestamps_ns do not increase")
+        if not (np.isfinite(self.offsets_m).all() and np.isfinite(self.heights_m).all()):
+            raise TakeError("offsets_m or heights_m hold a value that is not a number")
+        for name in (
+            "theta",
+            "bone_position_in_world_m",
+            "bone_rotation_in_world_wxyz",
+            "bone_quality",
+        ):
+            values = getattr(self, name)
+            finite = np.isfinite(values).all(axis=tuple(range(2, values.ndim)))
+            if (self.tracked & ~finite).any():
+                subject, frame = np.argwhere(self.tracked & ~finite)[0]
+                raise TakeError(
+                    f"{name} of '{self.subject_names[subject]}' is not a number in frame {frame}, "
+                    "which is marked tracked"
+                )
+        quaternion = self.bone_rotation_in_world_wxyz[self.tracked]
+        if not (
+            np.allclose(np.linalg.norm(quaternion, axis=-1), 1, atol=1e-6)
+            and (quaternion[..., 0] >= 0).all()
+        ):
+            raise TakeError("bone_rotation_in_world_wxyz holds a quaternion not unit with w >= 0")
+
+    @property
+    def skeleton(self) -> Skeleton:
+        """The tree of bones."""
+        return Skeleton(name=self.skeleton_name, bone_names=self.bone_names, parents=self.parents)
+
+    @property
+    def time_s(self) -> Float[np.ndarray, " t"]:
+        """Seconds since the first frame."""
+        return (self.timestamps_ns - self.timestamps_ns[:1]) * 1e-9
+
+    def subject(self, name: str) -> int:
+        """Index of the subject called `name`; raises `TakeError` naming the nearest one."""
+        if name not in self.subject_names:
+            raise TakeError(f"the take has no subject '{name}'{nearest(name, self.subject_names)}")
+        return self.subject_names.index(name)
+
+    def shape(self, subject: int) -> BodyShape:
+        """The body of one subject."""
+        return BodyShape(
+            skeleton=self.skeleton,
+            offsets_m=self.offsets_m[subject],
+            height_m=float(self.heights_m[subject]),
+        )
+
+    def bone_rotation_in_world(self, subject: int) -> Float[np.ndarray, "t b 3 3"]:
+        """Rotation matrices of one subject; NaN where untracked."""
+        matrices = np.full((*self.bone_quality[subject].shape, 3, 3), np.nan)
+        tracked = self.tracked[subject]
+        quaternion = self.bone_rotation_in_world_wxyz[subject, tracked]
+        matrices[tracked] = _matrix_from_wxyz(quaternion)
+        return matrices
+
+
+def provenance(
+    *,
+    options: Mapping[str, Any],
+    session_sha256: str | None = None,
+    simulated: bool = False,
+) -> dict[str, Any]:
+    """What a take says about its making: version, session, options, units, simulated or not."""
+    return {
+        "made_by": f"fusecap {metadata.version('fusecap')}",
+        "session_sha256": session_sha256,
+        "options": dict(options),
+        "simulated": simulated,
+        "units": UNITS,
+    }
+
+
+class TakeBuilder:
+    """Collects estimates frame by frame; `build` gives a valid take at any moment.
+
+    A subject is known by its name, so one that leaves and returns on a new track goes on in the
+    same row. Subjects stand in the order of `subject_names`, then of first appearance. A body has
+    one shape: the last one a subject was solved with poses all its frames. A solve that diverged
+    counts as untracked.
+    """
+
+    def __init__(
+        self,
+        *,
+        skeleton: Skeleton,
+        rate_hz: float,
+        subject_names: Sequence[str] = (),
+        provenance: Mapping[str, Any] | None = None,
+    ) -> None:
+        self._skeleton = skeleton
+        self._rate_hz = rate_hz
+        self._provenance = dict(provenance or {})
+        self._timestamps_ns: list[int] = []
+        self._solved: dict[str, list[tuple[int, np.ndarray, np.ndarray]]] = {
+            name: [] for name in subject_names
+        }
+        """Per subject: frame, theta, bone quality."""
+        self._shapes: dict[str, BodyShape] = {}
+
+    def add(self, timestamp_ns: int, estimates: Iterable[Estimate]) -> None:
+        """The next frame: everyone solved at `timestamp_ns`; nobody is fine."""
+        frame = len(self._timestamps_ns)
+        self._timestamps_ns.append(timestamp_ns)
+        for estimate in estimates:
+            rows = self._solved.setdefault(estimate.name, [])
+            if rows and rows[-1][0] == frame:
+                raise TakeError(f"two estimates of '{estimate.name}' at {timestamp_ns} ns")
+            self._shapes[estimate.name] = estimate.shape
+            if estimate.status is not Status.DIVERGED:
+                rows.append((frame, estimate.theta.copy(), estimate.bone_quality.copy()))
+
+    def build(self) -> Take:
+        """What was added so far; subjects never seen have the reference shape and no frame."""
+        skeleton = self._skeleton
+        s, t, b = len(self._solved), len(self._timestamps_ns), skeleton.bone_count
+        reference = BodyShape.from_height(skeleton, REFERENCE_HEIGHT_M)
+        shapes = [self._shapes.get(name, reference) for name in self._solved]
+        theta = np.full((s, t, skeleton.pose_size), np.nan)
+        quality = np.full((s, t, b), np.nan)
+        tracked = np.zeros((s, t), dtype=bool)
+        for subject, rows in enumerate(self._solved.values()):
+            for frame, frame_theta, frame_quality in rows:
+                theta[subject, frame] = frame_theta
+                quality[subject, frame] = frame_quality
+                tracked[subject, frame] = True
+        return take_from_theta(
+            theta,
+            shapes,
+            timestamps_ns=np.array(self._timestamps_ns, dtype=np.int64),
+            rate_hz=self._rate_hz,
+            subject_names=tuple(self._solved),
+            skeleton=skeleton,
+            tracked=tracked,
+            bone_quality=quality,
+            provenance=self._provenance,
+        )
+
+
+def take_from_theta(
+    theta: Float[np.ndarray, "s t p"],
+    shapes: Sequence[BodyShape],
+    *,
+    timestamps_ns: Int[np.ndarray, " t"],
+    rate_hz: float,
+    subject_names: tuple[str, ...],
+    skeleton: Skeleton,
+    tracked: Bool[np.ndarray, "s t"] | None = None,
+    bone_quality: Float[np.ndarray, "s t b"] | None = None,
+    provenance: Mapping[str, Any] | None = None,
+) -> Take:
+    """A take of known poses; tracked everywhere and of quality 1 unless told."""
+    s, t, b = len(subject_names), len(timestamps_ns), skeleton.bone_count
+    if tracked is None:
+        tracked = np.ones((s, t), dtype=bool)
+    if bone_quality is None:
+        bone_quality = np.ones((s, t, b))
+    position = np.full((s, t, b, 3), np.nan)
+    quaternion = np.full((s, t, b, 4), np.nan)
+    for subject, shape in enumerate(shapes):
+        frames = tracked[subject]
+        if frames.any():
+            position[subject, frames], rotation = forward_kinematics(shape, theta[subject, frames])
+            quaternion[subject, frames] = _wxyz_from_matrix(rotation)
+    return Take(
+        timestamps_ns=timestamps_ns,
+        rate_hz=rate_hz,
+        subject_names=subject_names,
+        skeleton_name=skeleton.name,
+        bone_names=skeleton.bone_names,
+        parents=skeleton.parents,
+        heights_m=np.array([shape.height_m for shape in shapes], dtype=np.float64),
+        offsets_m=np.array([shape.offsets_m for shape in shapes]).reshape(s, b, 3),
+        theta=theta,
+        bone_position_in_world_m=position,
+        bone_rotation_in_world_wxyz=quaternion,
+        tracked=tracked,
+        bone_quality=bone_quality,
+        provenance=dict(provenance or {}),
+    )
+
+
+def save_take(take: Take, path: Path | str) -> None:
+    """Write `take` whole or not at all; raises `TakeError` with the reason."""
+    arrays = {
+        "format": np.array(_FORMAT),
+        "timestamps_ns": take.timestamps_ns,
+        "rate_hz": np.array(take.rate_hz),
+        "subject_names": np.array(take.subject_names, dtype=np.str_),
+        "skeleton": np.array(take.skeleton_name),
+        "bone_names": np.array(take.bone_names, dtype=np.str_),
+        "parents": np.array(take.parents, dtype=np.int64),
+        "heights_m": take.heights_m,
+        "offsets_m": take.offsets_m,
+        "theta": take.theta,
+        "bone_position_in_world_m": take.bone_position_in_world_m,
+        "bone_rotation_in_world_wxyz": take.bone_rotation_in_world_wxyz,
+        "tracked": take.tracked,
+        "bone_quality": take.bone_quality,
+        "provenance": np.array(json.dumps(take.provenance, sort_keys=True, default=str)),
+    }
+    with written_whole(Path(path)) as file:
+        np.savez(file, **arrays)
+
+
+def load_take(path: Path | str) -> Take:
+    """Read a take; raises `TakeError` for a file that is missing, damaged or something else."""
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            archive = np.load(file, allow_pickle=False)
+            if not isinstance(archive, NpzFile):
+                raise ValueError("a single array")
+            arrays = {name: archive[name] for name in archive.files}
+    except FileNotFoundError:
+        raise TakeError(f"there is no take at {path}") from None
+    except OSError as error:
+        raise TakeError(f"cannot read {path}: {error.strerror or error}") from error
+    except (zipfile.BadZipFile, zlib.error, EOFError) as error:
+        raise TakeError(f"{path} is damaged or cut short ({error}); solve it again") from error
+    except ValueError as error:
+        raise TakeError(f"{path} is not a take: expected an .npz written by fusecap") from error
+    found = str(arrays.get("format", ""))
+    if not found.startswith("fusecap take "):
+        raise TakeError(f"{path} is not a take: it has no 'format' entry of fusecap")
+    if found != _FORMAT:
+        raise TakeError(f"{path} is a '{found}', this version reads '{_FORMAT}'; update fusecap")
+    try:
+        return _take_from_arrays(arrays)
+    except KeyError as error:
+        raise TakeError(f"{path}: the take has no {error}") from None
+    except (TakeError, ValueError, TypeError) as error:
+        raise TakeError(f"{path}: {error}") from error
+
+
+def _take_from_arrays(arrays: Mapping[str, np.ndarray]) -> Take:
+    return Take(
+        timestamps_ns=arrays["timestamps_ns"].astype(np.int64),
+        rate_hz=float(arrays["rate_hz"]),
+        subject_names=tuple(arrays["subject_names"].tolist()),
+        skeleton_name=str(arrays["skeleton"]),
+        bone_names=tuple(arrays["bone_names"].tolist()),
+        parents=tuple(arrays["parents"].tolist()),
+        heights_m=arrays["heights_m"].astype(np.float64),
+        offsets_m=arrays["offsets_m"].astype(np.float64),
+        theta=arrays["theta"].astype(np.float64),
+        bone_position_in_world_m=arrays["bone_position_in_world_m"].astype(np.float64),
+        bone_rotation_in_world_wxyz=arrays["bone_rotation_in_world_wxyz"].astype(np.float64),
+        tracked=arrays["tracked"].astype(bool),
+        bone_quality=arrays["bone_quality"].astype(np.float64),
+        provenance=json.loads(str(arrays["provenance"])),
+    )
+
+
+def _wxyz_from_matrix(rotation: Float[np.ndarray, "t b 3 3"]) -> Float[np.ndarray, "t b 4"]:
+    xyzw = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_quat(canonical=True)
+    return np.roll(xyzw, 1, axis=1).reshape(*rotation.shape[:2], 4)
+
+
+def _matrix_from_wxyz(quaternion: Float[np.ndarray, "t b 4"]) -> Float[np.ndarray, "t b 3 3"]:
+    xyzw = np.roll(quaternion.reshape(-1, 4), -1, axis=1)
+    if len(xyzw) == 0:
+        return np.empty((*quaternion.shape[:2], 3, 3))
+    return Rotation.from_quat(xyzw).as_matrix().reshape(*quaternion.shape[:2], 3, 3)
