@@ -41,9 +41,8 @@ from fusecap.evaluate.twin import (
     TWIN_RIG_NOISE,
 )
 from fusecap.motion.clips import Clip, save_clips
-from fusecap.setup import Scene, make_sorter
+from fusecap.setup import Setup
 from fusecap.solve.estimator import SubjectModel
-from fusecap.solve.options import SolverOptions
 from fusecap.solve.pose_solver import ImuSites
 from fusecap.types import Detections, ImuReading
 
@@ -209,15 +208,12 @@ def errors(simulation: Simulation, landmarks: LandmarkSet) -> Errors:
     def measured(heights_m: dict[str, float]) -> MeasuredBody:
         height_m = heights_m.get("anna")
         told = BodyShape.from_height(PAPER21, height_m) if height_m else None
-        (body,) = measure_bodies(
-            lambda models: _scene(simulation, landmarks, models, told),
-            instants,
-            heights_m=heights_m,
-        )
+        setup = _setup(simulation, landmarks, told)
+        (body,) = measure_bodies(setup, instants, heights_m=heights_m)
         return body
 
     unknown, known = measured({}), measured({"anna": truth.height_m})
-    take = solve_instants(_scene(simulation, landmarks, None, None), instants).take
+    take = solve_instants(_setup(simulation, landmarks, None), instants).take
     true = _lengths(truth)
     return Errors(
         unknown=_lengths(unknown.shape) - true,
@@ -242,12 +238,7 @@ def _sigmas(body: MeasuredBody) -> np.ndarray:
     return np.array([[sigma[f"{side}_{bone}"] for side in ("left", "right")] for bone in LIMBS])
 
 
-def _scene(
-    simulation: Simulation,
-    landmarks: LandmarkSet,
-    models: Sequence[SubjectModel] | None,
-    told: BodyShape | None,
-) -> Scene:
+def _setup(simulation: Simulation, landmarks: LandmarkSet, told: BodyShape | None) -> Setup:
     person = simulation.people[0]
     imus = simulation.imus.get(person.name)
     sites = ImuSites.none()
@@ -257,17 +248,13 @@ def _scene(
             position_m=np.ascontiguousarray(imus.position_in_bone_m, dtype=np.float64),
         )
     start_m = (float(person.theta[0, 0]), float(person.theta[0, 2]))
-    own = SubjectModel(name=person.name, shape=told, sites=sites, start_m=start_m)
-    subjects = tuple(models) if models is not None else (own,)
-    return Scene(
+    return Setup(
         rig=simulation.rig,
         landmarks=landmarks,
         skeleton=PAPER21,
-        rate_hz=simulation.rate_hz,
-        subjects=subjects,
-        sorter=make_sorter(simulation.rig, landmarks, subjects),
         prior=load_prior(PAPER21),
-        options=SolverOptions(),
+        rate_hz=simulation.rate_hz,
+        subjects=(SubjectModel(name=person.name, shape=told, sites=sites, start_m=start_m),),
     )
 
 

@@ -24,6 +24,7 @@ from solve_scene import KnownSorter, Scene, scene
 from fusecap.body.skeleton import EXTENDED23
 from fusecap.evaluate.imu_noise import IMUS_6
 from fusecap.pipeline import Pipeline
+from fusecap.setup import Setup
 
 PASSES = 3
 
@@ -71,15 +72,15 @@ def people_row(people: int, frames: int) -> None:
     ]
 
     def prepare(pool: ThreadPoolExecutor | None) -> Callable[[int], object]:
-        pipeline = Pipeline(
+        setup = Setup(
             rig=simulation.rig,
             landmarks=simulation.landmark_set,
             skeleton=built.models[0].shape.skeleton,
             prior=built.prior,
-            sorter=KnownSorter(built),
+            rate_hz=simulation.rate_hz,
             subjects=built.models,
-            pool=pool,
         )
+        pipeline = Pipeline(setup, sorter=KnownSorter(built), pool=pool)
         return lambda frame: pipeline.step(simulation.detections[frame], readings[frame])
 
     alone = best_ms(frames, lambda: prepare(None))

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fusecap.batch.solve import solve_instants
+from fusecap.batch.solve import SessionInstants, solve_instants
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.calibrate.offsets import (
     OffsetSamples,
@@ -42,7 +42,7 @@ from fusecap.evaluate.twin import (
     twin_simulation,
     twin_training_sequences,
 )
-from fusecap.setup import SessionInstants, scene_of
+from fusecap.setup import setup_of
 from fusecap.sources.session import load_session
 from fusecap.sources.session_data import open_session
 from fusecap.take import Take
@@ -138,7 +138,8 @@ def shelf(folder: Path, first: int = 150, end: int = 301) -> None:
         assert landmarks is not None
 
         def take(landmarks: LandmarkSet, first: int, end: int) -> Take:
-            return solve_instants(scene_of(data, landmarks), SessionInstants(data, first, end)).take
+            setup = setup_of(data.session, data.rig, landmarks)
+            return solve_instants(setup, SessionInstants(data, first, end)).take
 
         found = self_calibrate(
             lambda landmarks: take(landmarks, first, end),

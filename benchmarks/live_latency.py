@@ -47,12 +47,12 @@ from live_scenes import (
     work_like_networks,
 )
 
-from fusecap.engine.live_setup import setup_of
 from fusecap.live.devices.playback_sources import PlaybackOptions, playback_sources
 from fusecap.live.devices.source import SessionClock
 from fusecap.live.recorder import Recorder
 from fusecap.live.report import LiveReport
 from fusecap.live.run import LiveOptions, LiveRun
+from fusecap.setup import session_setup
 from fusecap.sources.session import load_session
 
 Prepare = Callable[[Path, argparse.Namespace], LiveRun]
@@ -61,7 +61,9 @@ Prepare = Callable[[Path, argparse.Namespace], LiveRun]
 def outside(folder: Path, arguments: argparse.Namespace) -> LiveRun:
     session, clock = load_session(simulated_session(folder)), SessionClock()
     sources = playback_sources(session, clock, PlaybackOptions(there_and_back=True))
-    return LiveRun(setup_of(session, simulated=True), sources, None, LiveOptions(), clock=clock)
+    return LiveRun(
+        session_setup(session, simulated=True), sources, None, LiveOptions(), clock=clock
+    )
 
 
 def memory(folder: Path, arguments: argparse.Namespace) -> LiveRun:
@@ -78,7 +80,7 @@ def _clip(path: Path, options: PlaybackOptions, arguments: argparse.Namespace) -
     session, clock = load_session(path), SessionClock()
     detector = networks(arguments.threads)
     sources = playback_sources(session, clock, options)
-    setup = setup_of(session, detector.landmarks)
+    setup = session_setup(session, detector.landmarks)
     delay = LiveOptions(delay_s=arguments.delay)
     return LiveRun(setup, sources, detector, delay, clock=clock)
 
@@ -87,7 +89,7 @@ def simulated(folder: Path, arguments: argparse.Namespace) -> LiveRun:
     session, clock = load_session(simulated_session(folder)), SessionClock()
     subjects = tuple(subject.model_copy(update={"imus": ()}) for subject in session.subjects)
     session = session.model_copy(update={"subjects": subjects})
-    setup = setup_of(session, simulated=True)
+    setup = session_setup(session, simulated=True)
     seen: dict[int, np.ndarray] = {}
     sources = [
         AsPictures(source, seen, (1920, 1080))

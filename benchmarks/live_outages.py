@@ -54,7 +54,7 @@ def main() -> None:
     for scene, phases in SCENES.items():
         simulation = live_scene.capture(SECONDS, imus=scene != "cameras only")
         with tempfile.TemporaryDirectory() as folder:
-            engine = Engine(live_scene.setup_of(simulation, Path(folder)))
+            engine = Engine(live_scene.simulated_setup(simulation, Path(folder)))
         samples = live_scene.kept(live_scene.samples_of(simulation), phases)
         steps, tick_ms = [], []
         for event in merged(samples, live_scene.ticks_of(simulation)):

@@ -38,8 +38,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from live_scenes import AsPictures, SimulatedDetector, receivers, send_to, simulated_session
 
-from fusecap.engine.live_setup import setup_of
-from fusecap.engine.step import LiveStep
+from fusecap.engine.engine import LiveStep
 from fusecap.live.devices.faults import Fault, FaultKind, FaultyDetector, with_faults
 from fusecap.live.devices.playback_sources import PlaybackOptions, playback_sources
 from fusecap.live.devices.source import SessionClock
@@ -47,6 +46,7 @@ from fusecap.live.recorder import Recorder
 from fusecap.live.report import LiveReport
 from fusecap.live.run import LiveOptions, LiveRun
 from fusecap.live.status import LiveStatus
+from fusecap.setup import session_setup
 from fusecap.sources.session import load_session
 from fusecap.take import Take, load_take
 from fusecap.types import CameraImage, Event
@@ -291,7 +291,7 @@ def soak(seconds: float, *, seed: int = 0, room_bytes: int | None = None) -> Soa
         folder = Path(name)
         session, clock = load_session(simulated_session(folder)), SessionClock()
         truth = load_take(folder / "truth.npz")
-        setup = setup_of(session, simulated=True)
+        setup = session_setup(session, simulated=True)
         seen: dict[int, np.ndarray] = {}
         cameras = len(setup.rig)
         played = playback_sources(session, clock, PlaybackOptions(there_and_back=True))

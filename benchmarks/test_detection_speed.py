@@ -23,7 +23,7 @@ import av
 import numpy as np
 import pytest
 
-from fusecap.batch.detect import detect_videos, session_scene, session_videos
+from fusecap.batch.detect import detect_videos, session_videos, video_setup
 from fusecap.detect.build import build_detector
 from fusecap.detect.detector import DetectorOptions
 from fusecap.detect.packing import PackedPersonDetector
@@ -105,10 +105,10 @@ def test_instants_per_second_from_videos_to_files(benchmark, tmp_path, size, peo
     session = load_session(session_file(tmp_path, people))
     detector = build_detector(options(size), threads=THREADS)
     cameras = session_videos(session)
-    scene = session_scene(session, cameras, detector.landmarks)
+    setup = video_setup(session, cameras, detector.landmarks)
     start_cpu = time.process_time()
     found = benchmark.pedantic(
-        lambda: detect_videos(cameras, detector, scene=scene), rounds=1, iterations=1
+        lambda: detect_videos(cameras, detector, setup=setup), rounds=1, iterations=1
     )
     instants = found.frames_detected / len(cameras)
     record(

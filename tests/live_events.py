@@ -6,9 +6,8 @@ from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
-from fusecap.engine.engine import Engine
-from fusecap.engine.live_setup import LiveSetup
-from fusecap.engine.step import LiveStep
+from fusecap.engine.engine import Engine, LiveStep
+from fusecap.setup import SessionSetup
 from fusecap.sources.session_data import SessionData, open_imus
 from fusecap.types import CameraSample, Event, ImuSample, Tick
 
@@ -57,9 +56,11 @@ def merged(
     return [event for *_, event in sorted(due, key=lambda item: item[:2])]
 
 
-def setup_for(data: SessionData) -> LiveSetup:
+def setup_for(data: SessionData) -> SessionSetup:
     assert data.landmarks is not None
-    return LiveSetup(session=data.session, rig=data.rig, landmarks=data.landmarks, simulated=True)
+    return SessionSetup(
+        session=data.session, rig=data.rig, landmarks=data.landmarks, simulated=True
+    )
 
 
 def steps_of(engine: Engine, events: Iterable[Event]) -> Iterator[LiveStep]:

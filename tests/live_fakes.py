@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from fusecap.body.landmarks import LANDMARK_SETS
-from fusecap.engine.live_setup import LiveSetup
-from fusecap.engine.step import LiveStep
+from fusecap.engine.engine import LiveStep
 from fusecap.geometry.camera import Rig
 from fusecap.live.devices.source import Deliver, SessionClock, SourceCounts
 from fusecap.pipeline import Step
+from fusecap.setup import SessionSetup
 from fusecap.sources.session import Session
 from fusecap.types import (
     CameraImage,
@@ -41,7 +41,9 @@ def wait_for(condition: Callable[[], object], seconds: float = 20.0) -> None:
         time.sleep(0.002)
 
 
-def live_setup(rig: Rig, *, rate_hz: float = 60.0, sensors: Sequence[str] = ("head",)) -> LiveSetup:
+def live_setup(
+    rig: Rig, *, rate_hz: float = 60.0, sensors: Sequence[str] = ("head",)
+) -> SessionSetup:
     """A session of the rig's cameras and of anna, who wears sensors."""
     session = Session.model_validate(
         {
@@ -51,7 +53,7 @@ def live_setup(rig: Rig, *, rate_hz: float = 60.0, sensors: Sequence[str] = ("he
         },
         context={"file": Path("session.toml")},
     )
-    return LiveSetup(session=session, rig=rig, landmarks=BODY25)
+    return SessionSetup(session=session, rig=rig, landmarks=BODY25)
 
 
 def imu_sample(timestamp_ns: int, bone: str = "head") -> ImuSample:

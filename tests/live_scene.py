@@ -15,8 +15,7 @@ from fusecap.body.landmarks import landmark_set_named
 from fusecap.body.motion_model import load_demo_motion
 from fusecap.body.shape import REFERENCE_HEIGHT_M, BodyShape
 from fusecap.body.skeleton import PAPER21
-from fusecap.engine.live_setup import LiveSetup
-from fusecap.engine.step import LiveStep
+from fusecap.engine.engine import LiveStep
 from fusecap.evaluate import simulated_session
 from fusecap.evaluate.demo_scene import BYSTANDER_HEIGHT_M, SUBJECT_HEIGHTS_M, VOLUME_M
 from fusecap.evaluate.imu_noise import IMUS_13
@@ -28,6 +27,7 @@ from fusecap.evaluate.simulator import (
     placed,
     simulate,
 )
+from fusecap.setup import SessionSetup
 from fusecap.sources.session import parse_session
 from fusecap.types import CameraSample, ImuSample, Tick
 from live_events import Sample
@@ -90,7 +90,9 @@ def _captured(
     )
 
 
-def setup_of(simulation: Simulation, folder: Path, change: Callable[[str], str] = str) -> LiveSetup:
+def simulated_setup(
+    simulation: Simulation, folder: Path, change: Callable[[str], str] = str
+) -> SessionSetup:
     """As its session file has it, once `change` has edited that; of the rest little is written."""
     views = tuple(
         replace(view, times_s=view.times_s[:0], people=(), person=()) for view in simulation.views
@@ -114,7 +116,7 @@ def setup_of(simulation: Simulation, folder: Path, change: Callable[[str], str] 
     }
     path = simulated_session.write_session(replace(simulation, views=views, imus=imus), folder)
     path.write_text(change(path.read_text()))
-    return LiveSetup(
+    return SessionSetup(
         session=parse_session(path),
         rig=simulation.rig,
         landmarks=simulation.landmark_set,

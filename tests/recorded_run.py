@@ -8,13 +8,12 @@ from typing import BinaryIO
 
 import numpy as np
 
-from fusecap.engine.engine import Engine
-from fusecap.engine.live_setup import LiveSetup
-from fusecap.engine.step import LiveStep
+from fusecap.engine.engine import Engine, LiveStep
 from fusecap.evaluate.demo_scene import demo_scene
 from fusecap.evaluate.simulated_session import write_session
 from fusecap.recording import RecordingWriter
 from fusecap.recording.setup_json import setup_values
+from fusecap.setup import SessionSetup
 from fusecap.sources.session import load_session
 from fusecap.sources.session_data import open_session
 from fusecap.types import Command, CommandKind, Event
@@ -24,7 +23,7 @@ UNIX_NS = 1_700_000_000_000_000_000
 Taken = tuple[Event, LiveStep | None]
 
 
-def simulated_run(folder: Path, *, seconds: float = 1.0) -> tuple[LiveSetup, list[Taken]]:
+def simulated_run(folder: Path, *, seconds: float = 1.0) -> tuple[SessionSetup, list[Taken]]:
     """Four cameras, two people with 13 sensors each, samples that come late and twice."""
     rng = np.random.default_rng(5)
     data = open_session(load_session(write_session(demo_scene(seconds=seconds), folder)))
@@ -44,7 +43,7 @@ def simulated_run(folder: Path, *, seconds: float = 1.0) -> tuple[LiveSetup, lis
 
 def record(
     file: BinaryIO,
-    setup: LiveSetup,
+    setup: SessionSetup,
     taken: Sequence[Taken],
     *,
     flush_every: int = 500,

@@ -7,13 +7,13 @@ import pytest
 from typer.testing import CliRunner
 
 from fusecap.batch.detect import (
+    ExpectedPeople,
     detect_videos,
     detector_options,
     loose_videos,
-    session_scene,
     session_videos,
+    video_setup,
 )
-from fusecap.batch.expected_people import ExpectedPeople
 from fusecap.batch.overlay import draw_overlays
 from fusecap.body.landmarks import landmark_set_named
 from fusecap.cli import app
@@ -21,7 +21,7 @@ from fusecap.detect.build import build_detector
 from fusecap.detect.detector import DetectorOptions
 from fusecap.errors import InputError, SessionError
 from fusecap.export.overlay import PeopleNumbers
-from fusecap.setup import scene_before
+from fusecap.setup import setup_of
 from fusecap.sources.detection_files import read_record
 from fusecap.sources.keypoint_files import read_keypoints
 from fusecap.sources.session import load_session
@@ -345,10 +345,10 @@ def test_detector_table_and_command_line_change_options(tmp_path):
 def test_video_of_another_size_than_calibrated_is_refused(tmp_path):
     path = video_session(tmp_path)
     session = load_session(path)
-    assert session_scene(session, session_videos(session), COCO) is not None
+    assert video_setup(session, session_videos(session), COCO) is not None
     edit(tmp_path / "calibration.toml", "[64, 48]", "[128, 96]")
     with pytest.raises(SessionError, match="shows 64 x 48 px, but is calibrated for 128 x 96"):
-        session_scene(session, session_videos(session), COCO)
+        video_setup(session, session_videos(session), COCO)
 
 
 def test_two_videos_of_one_name_are_refused(tmp_path):
@@ -437,11 +437,11 @@ def test_a_view_that_lost_someone_is_told_where_they_are(tmp_path):
     rig = ring(4)
     video_session(tmp_path, frames=1)
     (tmp_path / "calibration.toml").write_text(calibration_toml(rig))
-    scene = scene_before(load_session(tmp_path / "session.toml"), rig, COCO)
+    setup = setup_of(load_session(tmp_path / "session.toml"), rig, COCO)
     times_s = np.arange(20) / 30
     points = walking_landmarks(COCO, times_s)
     images = [[camera.project(p) for camera in rig.cameras] for p in points]
-    expected = ExpectedPeople(scene, periods_s=[1 / 30] * 4, landmark_count=17)
+    expected = ExpectedPeople(setup, periods_s=[1 / 30] * 4, landmark_count=17)
     nobody = np.empty((0, 17, 3))
     stranger = np.column_stack([np.linspace(10, 60, 17), np.linspace(10, 90, 17), np.full(17, 0.7)])
     for n in range(19):

@@ -16,12 +16,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fusecap.engine.engine import Engine
-from fusecap.engine.live_setup import setup_of
-from fusecap.engine.step import LiveStep
+from fusecap.engine.engine import Engine, LiveStep
 from fusecap.live.devices.faults import Fault, with_faults
 from fusecap.live.devices.playback_sources import PlaybackOptions, playback_sources
 from fusecap.live.devices.source import SessionClock, Source, SourceLost
+from fusecap.setup import session_setup
 from fusecap.sources.session import load_session
 from fusecap.take import load_take
 from fusecap.types import Event, Tick
@@ -100,7 +99,7 @@ def events_of(path: Path, faults: Sequence[Fault], seconds: float) -> list[Event
 
 
 def steps_of(path: Path, events: Sequence[Event]) -> list[LiveStep]:
-    engine = Engine(setup_of(load_session(path), simulated=True))
+    engine = Engine(session_setup(load_session(path), simulated=True))
     steps = [engine.take(event) for event in events]
     return [step for step in steps if step is not None]
 

@@ -14,7 +14,7 @@ import pytest
 
 from fusecap.body.shape import BodyShape
 from fusecap.body.skeleton import PAPER21
-from fusecap.engine.step import LiveStep
+from fusecap.engine.engine import LiveStep
 from fusecap.errors import InputError
 from fusecap.live.devices.source import SessionClock
 from fusecap.live.latency import EXPOSURE_TO_PACKET, LatencyBook

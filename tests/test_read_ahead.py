@@ -2,7 +2,7 @@ import threading
 
 import pytest
 
-from fusecap.batch.read_ahead import read_ahead
+from fusecap.batch.detect import read_ahead
 
 
 def test_items_come_in_order_and_no_more_than_asked_for_are_made_ahead():

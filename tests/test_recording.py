@@ -26,13 +26,13 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
 from fusecap.body.landmarks import LANDMARK_SETS, LandmarkOffsets
-from fusecap.engine.live_setup import LiveSetup
 from fusecap.errors import InputError
 from fusecap.live.devices.source import SessionClock
 from fusecap.live.recorder import Recorder
 from fusecap.recording import RecordingWriter
 from fusecap.recording.reader import RecordedEvent, RecordedPose, Recording
 from fusecap.recording.setup_json import setup_from_values, setup_values
+from fusecap.setup import SessionSetup
 from fusecap.sources.session import Session
 from fusecap.types import CameraImage, CameraSample, Command, CommandKind, ImuSample, Tick
 from live_fakes import estimate_of, wait_for
@@ -64,7 +64,7 @@ def short(run, tmp_path_factory) -> Path:
     return path
 
 
-def small_setup() -> LiveSetup:
+def small_setup() -> SessionSetup:
     session = Session.model_validate(
         {
             "session": {"name": "small", "calibration": "/home/anna/secret/rig.toml"},
@@ -82,7 +82,7 @@ def small_setup() -> LiveSetup:
         )
     )
     rig = ring(2, distortion=(0.1, -0.02, 1e-3, 1 / 3, 1e-9))
-    return LiveSetup(session=session, rig=rig, landmarks=landmarks, simulated=True)
+    return SessionSetup(session=session, rig=rig, landmarks=landmarks, simulated=True)
 
 
 def events_in(path: Path) -> list[RecordedEvent]:

@@ -17,10 +17,10 @@ from fusecap.body.landmarks import LANDMARK_SETS
 from fusecap.cli import app
 from fusecap.doctor import diagnose_recording
 from fusecap.engine.engine import Engine
-from fusecap.engine.live_setup import LiveSetup
 from fusecap.errors import InputError
 from fusecap.geometry.camera import Rig
 from fusecap.recording.reader import Recording
+from fusecap.setup import SessionSetup
 from fusecap.sources.session import Session, load_session
 from fusecap.sources.session_data import open_session
 from fusecap.take import load_take
@@ -201,7 +201,7 @@ def test_second_solve_mounts_sensors_as_the_t_pose_of_the_run(tmp_path):
         },
         context={"file": tmp_path / "session.toml"},
     )
-    setup = LiveSetup(session=session, rig=Rig(cameras=()), landmarks=LANDMARK_SETS["body25"])
+    setup = SessionSetup(session=session, rig=Rig(cameras=()), landmarks=LANDMARK_SETS["body25"])
     taken = []
     engine = Engine(setup)
     for index in range(240):

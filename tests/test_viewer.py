@@ -24,8 +24,7 @@ from websockets.typing import Origin, Subprotocol
 from fusecap.body.pose import landmarks_in_world
 from fusecap.body.skeleton import EXTENDED23, PAPER21
 from fusecap.cli import app
-from fusecap.engine.live_setup import LiveSetup
-from fusecap.engine.step import LiveStep
+from fusecap.engine.engine import LiveStep
 from fusecap.errors import InputError, TakeError
 from fusecap.evaluate.errors_over_time import errors_over_time
 from fusecap.live.status import (
@@ -38,6 +37,7 @@ from fusecap.live.status import (
     StreamStatus,
 )
 from fusecap.pipeline import Step
+from fusecap.setup import SessionSetup
 from fusecap.take import Take
 from fusecap.types import (
     CameraImage,
@@ -517,10 +517,10 @@ class Submitted:
         self.commands.append(command)
 
 
-def setup_for(name: str) -> LiveSetup:
+def setup_for(name: str) -> SessionSetup:
     setup = live_setup(ring(2))
     subject = setup.session.subjects[0].model_copy(update={"name": name})
-    return LiveSetup(
+    return SessionSetup(
         session=setup.session.model_copy(update={"subjects": (subject,)}),
         rig=setup.rig,
         landmarks=setup.landmarks,

@@ -11,21 +11,21 @@ the GIL.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 
-from fusecap.body.landmarks import LandmarkSet
-from fusecap.body.prior import PosePrior
-from fusecap.body.skeleton import Skeleton
+from fusecap.associate.paper import PaperSorter
+from fusecap.associate.subjects import Subject
+from fusecap.associate.tracker import Tracker
 from fusecap.errors import SessionError
-from fusecap.geometry.camera import Rig
+from fusecap.geometry.camera import Camera
+from fusecap.setup import Setup
 from fusecap.solve.estimator import Estimator, SubjectModel
-from fusecap.solve.options import SolverOptions
 from fusecap.types import Detections, Estimate, ImuReading, Observation, TrackState, TrackUpdate
 
 BLIND_START_S = 2.0
@@ -87,38 +87,41 @@ def observation_of(
     return Observation(timestamp_ns=detections.timestamp_ns, keypoints=keypoints, imu=imu)
 
 
+def _own_sorter(setup: Setup) -> Sorter | None:
+    """As the setup asks for it; None without cameras."""
+    if not len(setup.rig):
+        return None
+    named = [Subject(name=model.name, start_m=model.start_m) for model in setup.subjects]
+    if setup.associate == "paper":
+        return PaperSorter(setup.rig, setup.landmarks, named)
+    options = setup.tracker
+    if len(setup.rig) == 1 and options.max_subjects is None and len(named) <= 1:
+        options = replace(options, max_subjects=1)
+    return Tracker(setup.rig, setup.landmarks, options, named)
+
+
 class Pipeline:
     """Sorts and solves one instant after the other."""
 
     def __init__(
-        self,
-        *,
-        rig: Rig,
-        landmarks: LandmarkSet,
-        skeleton: Skeleton,
-        prior: PosePrior,
-        sorter: Sorter | None,
-        subjects: Sequence[SubjectModel] = (),
-        options: SolverOptions | None = None,
-        pool: ThreadPoolExecutor | None = None,
+        self, setup: Setup, *, sorter: Sorter | None = None, pool: ThreadPoolExecutor | None = None
     ) -> None:
-        """Without a sorter (no camera) every subject is solved from its sensors alone.
+        """People are sorted as the setup says, or by a `sorter` of one's own.
 
         With a `pool` subjects are solved on its threads, to the same bits. A solve is so short that
         this pays only where solves are made longer (docs/benchmarks.md, "How it grows").
         """
-        self._rig = rig
-        self._landmarks = landmarks
-        self._skeleton = skeleton
-        self._prior = prior
-        self._sorter = sorter
-        self._options = options
-        self._models = {model.name: model for model in subjects}
+        self._setup = setup
+        self._sorter = sorter or _own_sorter(setup)
+        self._models = {model.name: model for model in setup.subjects}
         self._pool = pool
         self._estimators: dict[str, Estimator] = {}
         self._removed: set[str] = set()
         self._looked_ns: int | None = None
         """When a camera last looked, at the latest at the first instant."""
+        nobody = np.empty((0, len(setup.landmarks.landmark_names), 3))
+        self._detections = Detections(timestamp_ns=0, people=(nobody,) * len(setup.rig))
+        self._step = Step(updates=(), estimates=())
 
     def step(self, detections: Detections, readings: Mapping[str, ImuReading]) -> Step:
         """One instant: `readings` holds, by subject name, what its sensors say."""
@@ -129,7 +132,7 @@ class Pipeline:
             observation = observation_of(
                 update,
                 detections,
-                len(self._landmarks.landmark_names),
+                len(self._setup.landmarks.landmark_names),
                 readings.get(update.name),
             )
             work.append((self._estimator(update.name), update, observation))
@@ -137,20 +140,22 @@ class Pipeline:
             results = [_follow(*item) for item in work]
         else:
             results = list(self._pool.map(lambda item: _follow(*item), work))
-        return Step(
+        self._detections = detections
+        self._step = Step(
             updates=tuple(updates),
             estimates=tuple(estimate for estimate in results if estimate is not None),
         )
+        return self._step
 
     def make_estimator(self, model: SubjectModel) -> Estimator:
         """An estimator as this pipeline uses it."""
         return Estimator(
             model,
-            rig=self._rig,
-            landmarks=self._landmarks.of(model.name),
-            prior=self._prior,
-            skeleton=self._skeleton,
-            options=self._options,
+            rig=self._setup.rig,
+            landmarks=self._setup.landmarks.of(model.name),
+            prior=self._setup.prior,
+            skeleton=self._setup.skeleton,
+            options=self._setup.options,
         )
 
     def estimator(self, name: str) -> Estimator:
@@ -161,10 +166,28 @@ class Pipeline:
         """What is known about a subject; nothing about one the session does not name."""
         return self._models.get(name) or SubjectModel(name=name)
 
-    def predicted(self, names: Iterable[str], now_ns: int) -> list[Float[np.ndarray, "k 3"]]:
-        """Landmarks [m] expected at `now_ns` of those of these subjects that have a pose."""
-        points = [self._estimators[n].predict(now_ns) for n in names if n in self._estimators]
-        return [some for some in points if some is not None]
+    def expected(self, now_ns: int) -> list[Float[np.ndarray, "m k 3"]]:
+        """Per camera the people expected at `now_ns`: x, y [px], confidence; NaN, NaN, 0 unknown.
+
+        Everyone followed is predicted in the world and projected into every view, also into those
+        that had lost them; projections may lie outside the image. Detections that belong to nobody
+        (newcomers, bystanders, false ones) are expected where they were, unless there is no place
+        for anybody else.
+        """
+        names = {update.track_id: update.name for update in self._step.updates}
+        followed = {estimate.track_id for estimate in self._step.estimates}
+        known = (self._estimators.get(names[track_id]) for track_id in sorted(followed))
+        points = [some.predict(now_ns) for some in known if some is not None]
+        expected = []
+        for index, camera in enumerate(self._setup.rig.cameras):
+            people = self._detections.people[index]
+            taken = {u.person[index].item() for u in self._step.updates if u.track_id in followed}
+            others = range(0 if self._is_full else len(people))
+            free = [n for n in others if n not in taken]
+            projected = [_projected(camera, point) for point in points if point is not None]
+            visible = [p[None] for p in projected if _is_in_view(camera, p)]
+            expected.append(np.concatenate([*visible, people[free]]))
+        return expected
 
     def reinitialise(self, name: str = "") -> None:
         """Find a subject, or without a name everybody, anew: place, pose and unmeasured body.
@@ -192,7 +215,7 @@ class Pipeline:
         self._removed.add(name)
 
     @property
-    def is_full(self) -> bool:
+    def _is_full(self) -> bool:
         """Everyone there is a place for is being followed; others are bystanders."""
         return isinstance(self._sorter, Cast) and self._sorter.is_full
 
@@ -231,14 +254,25 @@ class Pipeline:
             track_id=known.track_id if known else index,
             name=name,
             state=TrackState.COASTING,
-            person=np.full(len(self._rig), -1),
-            landmarks_in_world_m=np.full((len(self._landmarks.landmark_names), 3), np.nan),
+            person=np.full(len(self._setup.rig), -1),
+            landmarks_in_world_m=np.full((len(self._setup.landmarks.landmark_names), 3), np.nan),
         )
 
     def _estimator(self, name: str) -> Estimator:
         if name not in self._estimators:
             self._estimators[name] = self.make_estimator(self.model(name))
         return self._estimators[name]
+
+
+def _projected(camera: Camera, points_m: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:
+    pixels = camera.project(points_m)
+    return np.concatenate([pixels, np.isfinite(pixels).all(axis=1, keepdims=True)], axis=1)
+
+
+def _is_in_view(camera: Camera, person: Float[np.ndarray, "k 3"]) -> bool:
+    xy = person[np.isfinite(person[:, 0]), :2]
+    inside = np.all((xy >= -0.5) & (xy <= np.array(camera.size_px) - 0.5), axis=1)
+    return bool(inside.any())
 
 
 def _follow(estimator: Estimator, update: TrackUpdate, observation: Observation) -> Estimate | None:

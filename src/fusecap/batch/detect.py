@@ -2,8 +2,9 @@
 
 Instants hold every frame of every camera once (`fusecap.sources.frame_sets.every_frame`), so a
 camera that is faster than the others has keypoints at all its own frames. The detector sees all
-views of an instant together and is told where people are expected
-(`fusecap.batch.expected_people`).
+views of an instant together and is told where people are expected: with calibrated cameras the
+whole pipeline runs along (`Pipeline.expected`), without a calibration everyone is expected where
+they were. The next pictures are decoded while networks look at the present ones.
 
 What a folder holds is reused as long as video, detector and landmark set are the same. Frames take
 their names whole, so folders are valid at any time. A folder that fusecap did not write is left
@@ -18,29 +19,31 @@ not written again.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
-from fusecap.batch.expected_people import ExpectedPeople
-from fusecap.batch.read_ahead import read_ahead
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.detect.detector import Detector, DetectorOptions
 from fusecap.errors import InputError, SessionError
 from fusecap.export import openpose
 from fusecap.files import safe_name
-from fusecap.setup import Scene, scene_before
+from fusecap.pipeline import Pipeline
+from fusecap.setup import Setup, setup_of
 from fusecap.sources.detection_files import DetectionRecord, mark, read_record
 from fusecap.sources.frame_sets import FramePlan, clock_times_ns, every_frame, frame_sets
 from fusecap.sources.keypoint_files import read_keypoints, read_people
 from fusecap.sources.session import Session
 from fusecap.sources.session_data import open_rig
 from fusecap.sources.video import Video
+from fusecap.types import Detections
 
 Progress = Callable[[str, int, int], None]
 """Called with (what is being done, done, total)."""
@@ -53,6 +56,10 @@ BLOCK_INSTANTS = 600
 
 _AHEAD = 2
 """Instants decoded ahead; each holds one picture per camera."""
+_HELD_PERIODS = 1.01
+"""Frame periods for which a view's last detections stand for it between its frames."""
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,9 +178,9 @@ def loose_videos(paths: Sequence[Path], out: Path) -> list[CameraVideo]:
     ]
 
 
-def session_scene(
+def video_setup(
     session: Session, cameras: Sequence[CameraVideo], landmarks: LandmarkSet
-) -> Scene | None:
+) -> Setup | None:
     """What is known about the room: with it, people are predicted in three dimensions.
 
     None without a calibration. Raises `SessionError` for videos of another size than calibrated.
@@ -191,19 +198,19 @@ def session_scene(
                 + f", but is calibrated for {calibrated.size_px[0]} x {calibrated.size_px[1]}; "
                 "use the video that was recorded, or calibrate at its size"
             )
-    return scene_before(session, rig, landmarks)
+    return setup_of(session, rig, landmarks)
 
 
 def detect_videos(
     cameras: Sequence[CameraVideo],
     detector: Detector,
     *,
-    scene: Scene | None = None,
+    setup: Setup | None = None,
     progress: Progress | None = None,
 ) -> Detected:
     """Finds everyone in every frame; Ctrl-C ends early with what was found until then.
 
-    `scene` has the cameras in this order. Raises `InputError` for a folder of other keypoints.
+    `setup` has the cameras in this order. Raises `InputError` for a folder of other keypoints.
     """
     started = time.perf_counter()
     works = [_Work(camera, detector, progress) for camera in cameras]
@@ -211,7 +218,7 @@ def detect_videos(
     interrupted = False
     loop_started = time.perf_counter()
     try:
-        _detect(works, detector, plan, scene, progress)
+        _detect(works, detector, plan, setup, progress)
     except KeyboardInterrupt:
         interrupted = True
     loop_s = time.perf_counter() - loop_started
@@ -235,7 +242,7 @@ def _detect(
     works: Sequence[_Work],
     detector: Detector,
     plan: FramePlan,
-    scene: Scene | None,
+    setup: Setup | None,
     progress: Progress | None,
 ) -> None:
     """Everything that has no file yet, and what comes before it in its block."""
@@ -248,13 +255,13 @@ def _detect(
     total = int((shown >= 0).sum())
     videos = [work.camera.video for work in works]
     todo = FramePlan(timestamps_ns=plan.timestamps_ns[rows], frame=shown)
-    expected, block = _expected_people(works, detector, scene), -1
+    expected, block = _expected_people(works, detector, setup), -1
     ahead = read_ahead(frame_sets(videos, todo), _AHEAD)
     for row, wanted, frames in zip(rows, shown, ahead, strict=True):
         if row // BLOCK_INSTANTS != block:
             block = row // BLOCK_INSTANTS
             detector.reset()
-            expected = _expected_people(works, detector, scene)
+            expected = _expected_people(works, detector, setup)
         images = [None if frame is None else frame.image for frame in frames.frames]
         people: list[np.ndarray | None] = [None] * len(works)
         if any(image is not None for image in images):
@@ -272,6 +279,19 @@ def _detect(
             progress("detecting frames", sum(work.looked_at for work in works), total)
 
 
+def read_ahead(items: Iterable[T], count: int) -> Generator[T, None, None]:
+    """The items (none of them None), up to `count` of them made ahead by a thread.
+
+    What making an item raises is raised where that item is asked for.
+    """
+    source = iter(items)
+    with ThreadPoolExecutor(max_workers=1, thread_name_prefix="read-ahead") as pool:
+        waiting = deque(pool.submit(next, source, None) for _ in range(count))
+        while (item := waiting.popleft().result()) is not None:
+            waiting.append(pool.submit(next, source, None))
+            yield item
+
+
 def _rows_to_detect(missing: Bool[np.ndarray, " n"]) -> Int[np.ndarray, " m"]:
     """Per block the instants from its first to the last that misses frames."""
     blocks = [
@@ -283,13 +303,41 @@ def _rows_to_detect(missing: Bool[np.ndarray, " n"]) -> Int[np.ndarray, " m"]:
 
 
 def _expected_people(
-    works: Sequence[_Work], detector: Detector, scene: Scene | None
+    works: Sequence[_Work], detector: Detector, setup: Setup | None
 ) -> ExpectedPeople:
     return ExpectedPeople(
-        scene,
+        setup,
         periods_s=[1.0 / work.camera.video.info.rate_hz for work in works],
         landmark_count=len(detector.landmarks.landmark_names),
     )
+
+
+class ExpectedPeople:
+    """Learns from each instant's detections where people will be at the next."""
+
+    def __init__(
+        self, setup: Setup | None, *, periods_s: Sequence[float], landmark_count: int
+    ) -> None:
+        """`periods_s` are the cameras' frame periods, in the order of the setup's rig."""
+        self._pipeline = None if setup is None else Pipeline(setup)
+        self._hold_ns = [round(_HELD_PERIODS * period_s * 1e9) for period_s in periods_s]
+        self._nobody = np.empty((0, landmark_count, 3))
+        self._people = [self._nobody] * len(periods_s)
+        self._seen_ns = [0] * len(periods_s)
+
+    def at(self, now_ns: int) -> list[Float[np.ndarray, "m k 3"]]:
+        """As `Pipeline.expected`."""
+        return self._people if self._pipeline is None else self._pipeline.expected(now_ns)
+
+    def learn(self, now_ns: int, people: Sequence[Float[np.ndarray, "n k 3"] | None]) -> None:
+        """Per camera who was seen at `now_ns`; None where it had no picture."""
+        for index, some in enumerate(people):
+            if some is not None:
+                self._people[index], self._seen_ns[index] = some, now_ns
+            elif now_ns - self._seen_ns[index] > self._hold_ns[index]:
+                self._people[index] = self._nobody
+        if self._pipeline is not None:
+            self._pipeline.step(Detections(timestamp_ns=now_ns, people=tuple(self._people)), {})
 
 
 class _Work:

@@ -15,17 +15,16 @@ import numpy as np
 
 from fusecap.batch.solve import Progress, Solved, SolveReport, describe_subjects
 from fusecap.body.shape import REFERENCE_HEIGHT_M, BodyShape
-from fusecap.engine.engine import Engine
-from fusecap.engine.live_setup import LiveSetup
-from fusecap.engine.step import LiveStep
+from fusecap.engine.engine import Engine, LiveStep
 from fusecap.errors import InputError
 from fusecap.recording.reader import SUFFIX, RecordedBody, RecordedEvent, RecordedPose, Recording
 from fusecap.recording.setup_json import setup_from_values
+from fusecap.setup import SessionSetup
 from fusecap.take import Take, TakeBuilder, load_take, provenance, take_from_theta
 from fusecap.types import Estimate
 
 
-def recorded_setup(recording: Recording) -> LiveSetup:
+def recorded_setup(recording: Recording) -> SessionSetup:
     """What the run knew before its first event; raises `InputError`."""
     return setup_from_values(recording.setup, recording.path)
 

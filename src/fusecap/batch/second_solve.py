@@ -20,7 +20,7 @@ from fusecap.engine.cameras import Cameras
 from fusecap.engine.sensors import Sensors
 from fusecap.errors import InputError
 from fusecap.recording.reader import RecordedEvent, Recording
-from fusecap.setup import scene_before, sites_of
+from fusecap.setup import setup_of
 from fusecap.sources.session import Session, SubjectSettings
 from fusecap.sources.session_data import MAX_INSTANTS
 from fusecap.types import (
@@ -90,9 +90,8 @@ def solve_recording(recording: Recording, progress: Progress | None = None) -> S
     session = _with_people(setup.session, commands)
     if any(command.kind is CommandKind.TPOSE for command in commands):
         session = _with_mountings(session, _mountings(recording, progress))
-    scene = scene_before(session, setup.rig, setup.landmarks, sites_of(session))
     return solve_instants(
-        scene,
+        setup_of(session, setup.rig, setup.landmarks),
         RecordedInstants(session, len(setup.landmarks.landmark_names), samples, times_ns),
         progress=progress,
         session_sha256=recording.sha256(),

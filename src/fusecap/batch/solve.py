@@ -14,13 +14,13 @@ import time
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from fusecap.body.shape import BodyShape
 from fusecap.pipeline import Pipeline, observation_of
-from fusecap.setup import Instants, Scene, SessionInstants, scene_of
+from fusecap.setup import Setup, setup_of
 from fusecap.solve.reprojection import Reprojection
 from fusecap.sources.session_data import SessionData
 from fusecap.take import Take, TakeBuilder, provenance
@@ -28,6 +28,40 @@ from fusecap.types import Detections, Estimate, ImuReading, TrackState, TrackUpd
 
 Progress = Callable[[str, int, int], None]
 """Called with (what is being done, instants done, instants in all)."""
+
+
+class Instants(Protocol):
+    """Recorded measurements on the solve's instants."""
+
+    def __len__(self) -> int: ...
+
+    def detections(self, instant: int) -> Detections:
+        """Everyone in every camera."""
+        ...
+
+    def readings(self, instant: int) -> Mapping[str, ImuReading]:
+        """By subject name, what its sensors say."""
+        ...
+
+
+class SessionInstants:
+    """The instants `first` to `end` (excluded) of an opened session; all of them unless told."""
+
+    def __init__(self, data: SessionData, first: int = 0, end: int | None = None) -> None:
+        self._data = data
+        self._instants = range(len(data.times_s))[first:end]
+
+    def __len__(self) -> int:
+        return len(self._instants)
+
+    def detections(self, instant: int) -> Detections:
+        """Everyone in every camera."""
+        return self._data.detections(self._instants[instant])
+
+    def readings(self, instant: int) -> Mapping[str, ImuReading]:
+        """By subject name, what its sensors say."""
+        row = self._instants[instant]
+        return {imus.subject: imus.reading(row) for imus in self._data.imus}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,9 +98,8 @@ class Solved:
 
 def solve_session(data: SessionData, *, progress: Progress | None = None) -> Solved:
     """Solve an opened session; raises `SessionError` where nothing can be solved."""
-    scene = scene_of(data)
     return solve_instants(
-        scene,
+        setup_of(data.session, data.rig, data.landmarks),
         SessionInstants(data),
         progress=progress,
         session_sha256=data.content_hash,
@@ -75,7 +108,7 @@ def solve_session(data: SessionData, *, progress: Progress | None = None) -> Sol
 
 
 def solve_instants(
-    scene: Scene,
+    setup: Setup,
     instants: Instants,
     *,
     progress: Progress | None = None,
@@ -85,28 +118,20 @@ def solve_instants(
 ) -> Solved:
     """Both passes over recorded instants."""
     started = time.perf_counter()
-    pipeline = Pipeline(
-        rig=scene.rig,
-        landmarks=scene.landmarks,
-        skeleton=scene.skeleton,
-        prior=scene.prior,
-        sorter=scene.sorter,
-        subjects=scene.subjects,
-        options=scene.options,
-    )
+    pipeline = Pipeline(setup)
     tracked = _first_pass(pipeline, instants, progress)
-    reprojection = Reprojection(scene.rig, scene.landmarks)
+    reprojection = Reprojection(setup.rig, setup.landmarks)
     builder = TakeBuilder(
-        skeleton=scene.skeleton,
-        rate_hz=scene.rate_hz,
-        subject_names=_in_order([model.name for model in scene.subjects], tracked.shapes),
+        skeleton=setup.skeleton,
+        rate_hz=setup.rate_hz,
+        subject_names=_in_order([model.name for model in setup.subjects], tracked.shapes),
         provenance=provenance(
-            options={"solver": asdict(scene.options), "cameras": list(scene.rig.names)},
+            options={"solver": asdict(setup.options), "cameras": list(setup.rig.names)},
             session_sha256=session_sha256,
             simulated=simulated,
         ),
     )
-    second = _SecondPass(scene, pipeline, tracked)
+    second = _SecondPass(setup, pipeline, tracked)
     solve_s, statuses = [], Counter()
     interrupted = tracked.interrupted
     try:
@@ -128,8 +153,8 @@ def solve_instants(
         take=take,
         report=SolveReport(
             instants=len(take.timestamps_ns),
-            duration_s=len(take.timestamps_ns) / scene.rate_hz,
-            cameras=len(scene.rig),
+            duration_s=len(take.timestamps_ns) / setup.rate_hz,
+            cameras=len(setup.rig),
             subjects=describe_subjects(take),
             reprojection_px=reprojection.summary(),
             solve_ms_median=float(np.median(solve_ms)),
@@ -199,8 +224,8 @@ def _named(updates: tuple[TrackUpdate, ...], names: Mapping[int, str]) -> list[T
 class _SecondPass:
     """Solves people from assignments that stand."""
 
-    def __init__(self, scene: Scene, pipeline: Pipeline, tracked: _Tracked) -> None:
-        self._landmark_count = len(scene.landmarks.landmark_names)
+    def __init__(self, setup: Setup, pipeline: Pipeline, tracked: _Tracked) -> None:
+        self._landmark_count = len(setup.landmarks.landmark_names)
         self._estimators = {}
         for name, shape in tracked.shapes.items():
             estimator = pipeline.make_estimator(pipeline.model(name))

@@ -45,14 +45,14 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.optimize import linear_sum_assignment
 
-from fusecap.batch.solve import Progress, solve_instants
+from fusecap.batch.solve import Progress, SessionInstants, solve_instants
 from fusecap.body.landmarks import LANDMARKS, LandmarkOffsets, LandmarkSet
 from fusecap.body.pose import landmarks_in_world
 from fusecap.errors import InputError
 from fusecap.evaluate.metrics import Summary, summarize
 from fusecap.geometry.camera import Rig
 from fusecap.geometry.triangulation import triangulate
-from fusecap.setup import SessionInstants, scene_of
+from fusecap.setup import setup_of
 from fusecap.sources.session_data import SessionData
 from fusecap.take import Take
 from fusecap.types import Detections
@@ -193,8 +193,8 @@ def calibrate_session(
     held_out = [data.detections(instant) for instant in range(trained, instants)]
 
     def solve(landmarks: LandmarkSet, end: int) -> Take:
-        scene = scene_of(data, landmarks)
-        return solve_instants(scene, SessionInstants(data, 0, end), progress=progress).take
+        setup = setup_of(data.session, data.rig, landmarks)
+        return solve_instants(setup, SessionInstants(data, 0, end), progress=progress).take
 
     if truth is not None:
         samples = measure_offsets(rig, landmarks, truth, train)

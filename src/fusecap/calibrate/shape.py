@@ -28,7 +28,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from fusecap.batch.solve import Progress, solve_instants
+from fusecap.batch.solve import Instants, Progress, solve_instants
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.body.shape import MAX_HEIGHT_M, MIN_HEIGHT_M, BodyShape
 from fusecap.body.skeleton import Skeleton
@@ -41,7 +41,7 @@ from fusecap.calibrate.offsets import (
 )
 from fusecap.errors import InputError, nearest
 from fusecap.evaluate.metrics import Summary
-from fusecap.setup import Instants, Scene
+from fusecap.setup import Setup
 from fusecap.solve.estimator import SubjectModel
 from fusecap.sources.toml_text import quoted
 from fusecap.take import Take
@@ -119,7 +119,7 @@ Part = Callable[[int, int], Instants]
 
 
 def calibrate_shape(
-    make_scene: Callable[[Sequence[SubjectModel] | None], Scene],
+    setup: Setup,
     part: Part,
     instants: int,
     *,
@@ -129,31 +129,29 @@ def calibrate_shape(
 ) -> ShapeCalibration:
     """Bodies from the first three quarters of a recording, checked on the rest.
 
-    `make_scene` gives a fresh scene, with these subjects or with its own. `heights_m` are the
-    stated statures. Raises `InputError` where nobody can be measured.
+    `heights_m` are the stated statures. Raises `InputError` where nobody can be measured.
     """
     trained = instants - round(HELD_OUT_SHARE * instants)
-    first = make_scene(None)
-    if len(first.rig) < 2:
-        raise InputError(f"bone lengths need two cameras or more, found {len(first.rig)}")
+    if len(setup.rig) < 2:
+        raise InputError(f"bone lengths need two cameras or more, found {len(setup.rig)}")
     bodies = measure_bodies(
-        make_scene, part(0, trained), heights_m=heights_m, subject=subject, progress=progress
+        setup, part(0, trained), heights_m=heights_m, subject=subject, progress=progress
     )
     rest = part(trained, instants)
     held_out = [rest.detections(instant) for instant in range(len(rest))]
-    before = solve_instants(make_scene(None), rest, progress=progress).take
+    before = solve_instants(setup, rest, progress=progress).take
     shapes = {body.name: body.shape for body in bodies}
-    after_scene = make_scene(_models(first, before, shapes))
-    after = solve_instants(after_scene, rest, progress=progress).take
+    measured = replace(setup, subjects=_models(setup, before, shapes))
+    after = solve_instants(measured, rest, progress=progress).take
     return ShapeCalibration(
         bodies=bodies,
-        held_out_before_px=reprojection_error_px(first.rig, first.landmarks, before, held_out),
-        held_out_after_px=reprojection_error_px(first.rig, first.landmarks, after, held_out),
+        held_out_before_px=reprojection_error_px(setup.rig, setup.landmarks, before, held_out),
+        held_out_after_px=reprojection_error_px(setup.rig, setup.landmarks, after, held_out),
     )
 
 
 def measure_bodies(
-    make_scene: Callable[[Sequence[SubjectModel] | None], Scene],
+    setup: Setup,
     instants: Instants,
     *,
     heights_m: Mapping[str, float],
@@ -161,8 +159,7 @@ def measure_bodies(
     progress: Progress | None = None,
 ) -> tuple[MeasuredBody, ...]:
     """Alternates solves and fits over all these instants."""
-    scene = make_scene(None)
-    take = solve_instants(scene, instants, progress=progress).take
+    take = solve_instants(setup, instants, progress=progress).take
     if subject is not None and subject not in take.subject_names:
         raise InputError(
             f"no '{subject}' was found in the session{nearest(subject, take.subject_names)}"
@@ -171,16 +168,16 @@ def measure_bodies(
     for round_ in range(ROUNDS):
         if round_:
             shapes = {name: body.shape for name, body in bodies.items()}
-            scene = make_scene(_models(scene, take, shapes))
-            take = solve_instants(scene, instants, progress=progress).take
+            setup = replace(setup, subjects=_models(setup, take, shapes))
+            take = solve_instants(setup, instants, progress=progress).take
         for index, name in enumerate(take.subject_names):
             if subject is not None and name != subject:
                 continue
-            moments = _moments(scene, take, index, instants)
+            moments = _moments(setup, take, index, instants)
             if len(moments.points) >= MIN_SAMPLES:
                 bodies[name] = _fitted(
-                    scene.skeleton,
-                    scene.landmarks.of(name),
+                    setup.skeleton,
+                    setup.landmarks.of(name),
                     name,
                     moments,
                     heights_m.get(name),
@@ -201,15 +198,15 @@ class _Moments:
     rotation: Float[np.ndarray, "t b 3 3"]
 
 
-def _moments(scene: Scene, take: Take, subject: int, instants: Instants) -> _Moments:
+def _moments(setup: Setup, take: Take, subject: int, instants: Instants) -> _Moments:
     frames = np.flatnonzero(take.tracked[subject])
     frames = frames[:: max(1, len(frames) // MAX_INSTANTS)]
     rotation = take.bone_rotation_in_world(subject)
-    bones = scene.landmarks.bones(scene.skeleton)
+    bones = setup.landmarks.bones(setup.skeleton)
     points, kept = [], []
     for frame in frames:
         moment = instants.detections(int(frame))
-        samples = measure_offsets(scene.rig, scene.landmarks, take, [moment])
+        samples = measure_offsets(setup.rig, setup.landmarks, take, [moment])
         row = np.flatnonzero(samples.person == subject)
         if len(row):
             local = samples.in_bone[row[0]] * take.heights_m[subject]
@@ -221,9 +218,9 @@ def _moments(scene: Scene, take: Take, subject: int, instants: Instants) -> _Mom
     )
 
 
-def _models(scene: Scene, take: Take, shapes: Mapping[str, BodyShape]) -> tuple[SubjectModel, ...]:
-    """The scene's subjects, and people it did not name, with these shapes."""
-    known = {model.name: model for model in scene.subjects}
+def _models(setup: Setup, take: Take, shapes: Mapping[str, BodyShape]) -> tuple[SubjectModel, ...]:
+    """The setup's subjects, and people it did not name, with these shapes."""
+    known = {model.name: model for model in setup.subjects}
     models = []
     for index, name in enumerate(take.subject_names):
         model = known.get(name) or SubjectModel(name=name, start_m=_start_m(take, index))

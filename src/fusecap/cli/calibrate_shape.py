@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,9 +11,6 @@ from fusecap.cli.common import Json, SessionPath, console, err, print_json, prog
 
 if TYPE_CHECKING:
     from fusecap.calibrate.shape import MeasuredBody, ShapeCalibration
-    from fusecap.setup import Scene
-    from fusecap.solve.estimator import SubjectModel
-    from fusecap.sources.session_data import SessionData
 
 EXAMPLE = "Example: fusecap calibrate shape recordings/rom --subject anna --out anna.toml"
 _LIMBS = tuple(
@@ -37,17 +33,18 @@ def shape(
     """
     from dataclasses import asdict
 
+    from fusecap.batch.solve import SessionInstants
     from fusecap.calibrate.shape import calibrate_shape, shape_toml
     from fusecap.calibrate.shape_plot import plot_bodies
     from fusecap.files import written_whole
-    from fusecap.setup import SessionInstants
+    from fusecap.setup import setup_of
     from fusecap.sources.session import load_session
     from fusecap.sources.session_data import open_session
 
     with progress(quiet=as_json) as show:
         data = open_session(load_session(session), show)
         found = calibrate_shape(
-            lambda subjects: _scene(data, subjects),
+            setup_of(data.session, data.rig, data.landmarks),
             lambda first, end: SessionInstants(data, first, end),
             len(data.times_s),
             heights_m={s.name: s.height_m for s in data.session.subjects if s.height_m},
@@ -89,26 +86,6 @@ def shape(
         err.print(problem, markup=False, soft_wrap=True)
     console.print(f"wrote {out}\nwrote {picture}", markup=False, soft_wrap=True)
     console.print("use it: copy height_m and bone_lengths_m into the session's \\[\\[subject]]")
-
-
-def _scene(data: SessionData, subjects: Sequence[SubjectModel] | None) -> Scene:
-    from dataclasses import replace
-
-    from fusecap.setup import make_sorter, scene_of
-
-    scene = scene_of(data)
-    if subjects is None:
-        return scene
-    settings = data.session.settings
-    sorter = make_sorter(
-        data.rig,
-        scene.landmarks,
-        subjects,
-        associate=settings.associate,
-        max_subjects=settings.max_subjects,
-        volume_m=settings.volume_m,
-    )
-    return replace(scene, subjects=tuple(subjects), sorter=sorter)
 
 
 def _problems(found: ShapeCalibration) -> list[str]:

@@ -57,8 +57,8 @@ def detect(
         detect_videos,
         detector_options,
         loose_videos,
-        session_scene,
         session_videos,
+        video_setup,
     )
     from fusecap.detect.build import build_detector
     from fusecap.detect.runtimes.choice import RUNTIMES
@@ -85,8 +85,8 @@ def detect(
         cameras = loose_videos(videos, out or videos[0].parent / "keypoints")
     with progress(quiet=as_json, rate=True) as show:
         detector = build_detector(options, show)
-        scene = session_scene(session, cameras, detector.landmarks) if session else None
-        found = detect_videos(cameras, detector, scene=scene, progress=show)
+        setup = video_setup(session, cameras, detector.landmarks) if session else None
+        found = detect_videos(cameras, detector, setup=setup, progress=show)
         files = []
         if overlay and not found.interrupted:
             from fusecap.batch.overlay import draw_overlays
@@ -109,8 +109,8 @@ def detect_missing(session: Session, *, quiet: bool) -> Detected | None:
     from fusecap.batch.detect import (
         detect_videos,
         detector_options,
-        session_scene,
         session_videos,
+        video_setup,
     )
     from fusecap.detect.build import build_detector
 
@@ -119,8 +119,8 @@ def detect_missing(session: Session, *, quiet: bool) -> Detected | None:
         return None
     with progress(quiet=quiet, rate=True) as show:
         detector = build_detector(detector_options(session), show)
-        scene = session_scene(session, cameras, detector.landmarks)
-        found = detect_videos(cameras, detector, scene=scene, progress=show)
+        setup = video_setup(session, cameras, detector.landmarks)
+        found = detect_videos(cameras, detector, setup=setup, progress=show)
     _warn(found)
     return found
 

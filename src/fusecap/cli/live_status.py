@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from fusecap.cli.common import console, err
 
 if TYPE_CHECKING:
-    from fusecap.engine.step import LiveStep
+    from fusecap.engine.engine import LiveStep
     from fusecap.live.report import LiveReport
     from fusecap.live.run import LiveRun
     from fusecap.live.status import LiveStatus, SourceStatus, StageLatency

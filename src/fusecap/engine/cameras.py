@@ -26,18 +26,15 @@ class Cameras:
 
     def __init__(self, rates_hz: Sequence[float], landmark_count: int) -> None:
         """`rates_hz` are used until a camera has shown its own rate."""
-        self.malformed = 0
-        """Samples of no camera, or of other keypoints."""
         self._samples = [Samples[People]() for _ in rates_hz]
         self._periods_s = [1.0 / rate_hz for rate_hz in rates_hz]
         self._nobody = np.empty((0, landmark_count, 3))
 
     def take(self, sample: CameraSample) -> None:
-        """Keep a sample; one that cannot be used is counted."""
+        """Keep a sample; one of no camera or of other keypoints is left out."""
         people = sample.people
         known = 0 <= sample.camera < len(self._samples)
         if not known or people.ndim != 3 or people.shape[1:] != self._nobody.shape[1:]:
-            self.malformed += 1
             return
         self._samples[sample.camera].insert(sample.timestamp_ns, _sound(people))
 
@@ -70,10 +67,6 @@ class Cameras:
             for camera, samples in enumerate(self._samples)
             if self.looks(camera, now_ns)
         ]
-
-    def unused(self) -> list[int]:
-        """Per camera how many samples came twice, too late or far too early."""
-        return [samples.duplicate + samples.misplaced for samples in self._samples]
 
     def _period_s(self, camera: int, now_ns: int) -> float:
         return self._samples[camera].period_s(now_ns) or self._periods_s[camera]

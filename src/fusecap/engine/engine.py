@@ -12,30 +12,54 @@ played back.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
 from fusecap.engine.cameras import Cameras
 from fusecap.engine.continuity import Continuity
-from fusecap.engine.expected import expected_people
-from fusecap.engine.live_setup import LiveSetup
 from fusecap.engine.sensors import Sensors
-from fusecap.engine.step import LiveStep
 from fusecap.errors import SessionError
 from fusecap.pipeline import Pipeline, Step
-from fusecap.setup import scene_before, sites_of
-from fusecap.types import CameraSample, Command, CommandKind, Detections, Event, ImuSample
+from fusecap.setup import SessionSetup, setup_of
+from fusecap.types import (
+    CameraSample,
+    Command,
+    CommandKind,
+    Detections,
+    Estimate,
+    Event,
+    ImuReading,
+    ImuSample,
+)
 
 LOST_S = 1.0
 """Without any measurement before a person is said to be lost."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LiveStep:
+    """One instant: what was measured, what the stages made of it, and what is sent."""
+
+    timestamp_ns: int
+    """On the session's clock."""
+    detections: Detections
+    """Interpolated to the instant."""
+    readings: Mapping[str, ImuReading]
+    """By subject, interpolated to the instant."""
+    step: Step
+    """As sorted and solved."""
+    people: Mapping[str, Estimate | None]
+    """Every subject in a lasting order, without jumps and with a quality that fades where nothing
+    measures; None while there is no pose to send."""
+
+
 class Engine:
     """One live run; owned by one thread."""
 
-    def __init__(self, setup: LiveSetup) -> None:
+    def __init__(self, setup: SessionSetup) -> None:
         session = setup.session
-        scene = scene_before(session, setup.rig, setup.landmarks, sites_of(session))
         self.notes: deque[str] = deque(maxlen=100)
         """What happened, in words, oldest first; the runtime takes them out."""
         self._cameras = Cameras(
@@ -43,16 +67,7 @@ class Engine:
             len(setup.landmarks.landmark_names),
         )
         self._sensors = Sensors(session.subjects)
-        self._pipeline = Pipeline(
-            rig=scene.rig,
-            landmarks=scene.landmarks,
-            skeleton=scene.skeleton,
-            prior=scene.prior,
-            sorter=scene.sorter,
-            subjects=scene.subjects,
-            options=scene.options,
-        )
-        self._rig = setup.rig
+        self._pipeline = Pipeline(setup_of(session, setup.rig, setup.landmarks))
         self._hold_s = session.live.hold_s
         self._people = {subject.name: Continuity(self._hold_s) for subject in session.subjects}
         """In a lasting order."""
@@ -63,8 +78,6 @@ class Engine:
         self._present: set[str] = set()
         self._seen: set[str] = set()
         self._step = Step(updates=(), estimates=())
-        nobody = np.empty((0, len(setup.landmarks.landmark_names), 3))
-        self._detections = Detections(timestamp_ns=0, people=(nobody,) * len(setup.rig))
         self._last_ns: int | None = None
 
     def take(self, event: Event) -> LiveStep | None:
@@ -87,19 +100,12 @@ class Engine:
 
     def expected(self, timestamp_ns: int) -> list[np.ndarray]:
         """Per camera (m, k, 3) people expected at an instant: x, y [px], confidence."""
-        return expected_people(
-            self._rig, self._pipeline, self._step, self._detections.people, timestamp_ns
-        )
+        return self._pipeline.expected(timestamp_ns)
 
     @property
     def mountings(self) -> dict[tuple[str, str], np.ndarray]:
         """R_ib (3, 3) by subject and bone, as stated or taken from a T-pose."""
         return self._sensors.mountings
-
-    def unused(self) -> dict[str, int]:
-        """By camera, and by "subject/bone", how many samples came twice, too late or too early."""
-        cameras = zip(self._rig.names, self._cameras.unused(), strict=True)
-        return {**dict(cameras), **self._sensors.unused()}
 
     def _solve(self, now_ns: int) -> LiveStep:
         detections = self._cameras.detections(now_ns)
@@ -116,7 +122,7 @@ class Engine:
             silent_ns = now_ns - (continuity.measured_ns or now_ns)
             people[name] = continuity.update(estimate, (views, name in readings), now_ns)
             self._watch(name, continuity.measured_ns == now_ns, silent_ns * 1e-9)
-        self._detections, self._step = detections, step
+        self._step = step
         return LiveStep(
             timestamp_ns=now_ns,
             detections=detections,

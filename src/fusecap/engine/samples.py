@@ -29,29 +29,25 @@ class Samples(Generic[Item]):
     """One source's latest items by time [ns]."""
 
     def __init__(self) -> None:
-        self.duplicate = 0
-        """Items of a time that was there already; the first stays."""
-        self.misplaced = 0
-        """Items too old or too far ahead to be of use."""
         self._times: list[int] = []
         self._items: list[Item] = []
         self._now_ns: int | None = None
 
     def insert(self, timestamp_ns: int, item: Item) -> None:
-        """Keep an item, wherever in time it belongs."""
+        """Keep an item, wherever in time it belongs.
+
+        Of two of the same time the first stays; one too old or too far ahead is of no use.
+        """
         now_ns = self._now_ns
         if now_ns is not None and not -KEPT_NS <= timestamp_ns - now_ns <= AHEAD_NS:
-            self.misplaced += 1
             return
         at = bisect_left(self._times, timestamp_ns)
         if at < len(self._times) and self._times[at] == timestamp_ns:
-            self.duplicate += 1
             return
         self._times.insert(at, timestamp_ns)
         self._items.insert(at, item)
         if len(self._times) > MAX_SAMPLES:
             del self._times[0], self._items[0]
-            self.misplaced += 1
 
     def forget_before(self, now_ns: int) -> None:
         """Let go of what is too old for the instant `now_ns` and those after it."""

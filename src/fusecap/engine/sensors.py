@@ -47,8 +47,6 @@ class Sensors:
     """The latest samples of every sensor of every subject, interpolated on demand."""
 
     def __init__(self, subjects: Sequence[SubjectSettings]) -> None:
-        self.malformed = 0
-        """Samples of no sensor, or without an orientation."""
         imus = [(subject.name, imu) for subject in subjects for imu in subject.imus]
         self._row = {(name, imu.bone): row for row, (name, imu) in enumerate(imus)}
         self._rows: dict[str, slice] = {}
@@ -65,11 +63,10 @@ class Sensors:
         self._bone_from_imu = np.array([_mounting(imu) for _, imu in imus]).reshape(-1, 3, 3)
 
     def take(self, sample: ImuSample) -> None:
-        """Keep a sample; one that cannot be used is counted."""
+        """Keep a sample; one of no sensor or without an orientation is left out."""
         row = self._row.get((sample.subject, sample.bone))
         norm = float(np.sqrt(np.dot(sample.orientation_wxyz, sample.orientation_wxyz)))
         if row is None or not 0.1 < norm < 10.0:
-            self.malformed += 1
             return
         orientation, accel = sample.orientation_wxyz, sample.accel_m_s2
         if abs(norm - 1.0) > 1e-9:
@@ -169,13 +166,6 @@ class Sensors:
             self._bone_from_imu[row] = world_from_bone.T @ world_from_imu
         missed = f"; not heard: {', '.join(silent)}" if silent else ""
         return f"{subject}: T-pose taken by {len(found)} sensors{missed}"
-
-    def unused(self) -> dict[str, int]:
-        """By "subject/bone" how many samples came twice, too late or far too early."""
-        return {
-            f"{subject}/{bone}": self._samples[row].duplicate + self._samples[row].misplaced
-            for (subject, bone), row in self._row.items()
-        }
 
 
 def _mounting(imu: ImuSettings) -> np.ndarray:

@@ -6,10 +6,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from fusecap.associate.tracker import TrackerOptions
 from fusecap.batch.solve import Progress, Solved, solve_instants
 from fusecap.body.prior import PosePrior, load_prior
 from fusecap.evaluate.simulator import Simulation
-from fusecap.setup import Scene, make_sorter
+from fusecap.setup import Setup
 from fusecap.solve.estimator import SubjectModel
 from fusecap.solve.options import SolverOptions
 from fusecap.solve.pose_solver import ImuSites
@@ -43,23 +44,18 @@ def solve_simulation(
                 start_m=(float(person.theta[0, 0]), float(person.theta[0, 2])),
             )
         )
-    scene = Scene(
+    setup = Setup(
         rig=simulation.rig,
         landmarks=simulation.landmark_set,
         skeleton=skeleton,
         rate_hz=simulation.rate_hz,
         subjects=tuple(models),
-        sorter=make_sorter(
-            simulation.rig,
-            simulation.landmark_set,
-            models,
-            associate=associate,
-            volume_m=simulation.volume_m,
-        ),
+        associate=associate,
+        tracker=TrackerOptions(volume_m=simulation.volume_m),
         prior=prior or load_prior(skeleton),
         options=options or SolverOptions(),
     )
-    return solve_instants(scene, _Instants(simulation), progress=progress, simulated=True)
+    return solve_instants(setup, _Instants(simulation), progress=progress, simulated=True)
 
 
 class _Instants:

@@ -6,9 +6,9 @@ import os
 import time
 from pathlib import Path
 
-from fusecap.engine.live_setup import LiveSetup
 from fusecap.live.devices.source import Delivery
 from fusecap.live.status import Light, SourceStatus
+from fusecap.setup import SessionSetup
 from fusecap.types import ImuSample
 
 LATE_S = 0.1
@@ -115,7 +115,7 @@ class Input:
         )
 
 
-def inputs_of(setup: LiveSetup) -> dict[Key, Input]:
+def inputs_of(setup: SessionSetup) -> dict[Key, Input]:
     """Everything that a session expects to hear from: cameras, then sensors."""
     inputs: dict[Key, Input] = {
         index: Input(camera.name, "camera") for index, camera in enumerate(setup.session.cameras)

@@ -8,11 +8,11 @@ from collections.abc import Callable
 from fusecap.batch.detect import detector_options
 from fusecap.detect.build import build_detector
 from fusecap.detect.detector import Detector
-from fusecap.engine.live_setup import LiveSetup, setup_of
 from fusecap.errors import SessionError
 from fusecap.live.devices.open_devices import device_sources
 from fusecap.live.devices.playback_sources import PlaybackOptions, playback_sources
 from fusecap.live.devices.source import SessionClock, Source
+from fusecap.setup import SessionSetup, session_setup
 from fusecap.sources.live_address import KeypointFolder, parse_camera_address
 from fusecap.sources.session import CameraSettings, Session
 
@@ -22,7 +22,7 @@ Progress = Callable[[str, int, int], None]
 
 def open_setup(
     session: Session, *, playback: bool, progress: Progress | None = None
-) -> tuple[LiveSetup, Detector | None]:
+) -> tuple[SessionSetup, Detector | None]:
     """What poses depend on, and the detector where a camera brings pictures.
 
     One core is left to everything else. Raises `InputError`; where the session has nothing to
@@ -30,7 +30,7 @@ def open_setup(
     """
     pictures = [camera for camera in session.cameras if _brings_pictures(camera, playback=playback)]
     if not pictures:
-        return setup_of(session), None
+        return session_setup(session), None
     threads = max(1, (os.cpu_count() or 1) - 1)
     detector = build_detector(
         detector_options(session), progress, threads=threads, follow_others=False
@@ -43,7 +43,7 @@ def open_setup(
                 f"keypoints, the detector {landmarks.name}; let the detector see every camera, or "
                 "none"
             )
-    return setup_of(session, landmarks), detector
+    return session_setup(session, landmarks), detector
 
 
 def open_sources(

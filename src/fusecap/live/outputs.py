@@ -7,11 +7,11 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from fusecap.body.shape import REFERENCE_HEIGHT_M, BodyShape
-from fusecap.engine.live_setup import LiveSetup
 from fusecap.live.devices.source import SessionClock
 from fusecap.live.health import Meter
 from fusecap.live.latency import LatencyBook
 from fusecap.live.status import StreamStatus
+from fusecap.setup import SessionSetup
 from fusecap.streams.person_pose import PersonPose, StreamFrame
 from fusecap.streams.streams import Cast, Stream
 
@@ -20,7 +20,7 @@ _NEWS_EVERY_NS = 1_000_000_000
 _SAME_BODY_M = 0.002
 
 
-def first_cast(setup: LiveSetup) -> Cast:
+def first_cast(setup: SessionSetup) -> Cast:
     """The session's people with the bodies known so far, before anyone is found."""
     skeleton = setup.session.skeleton
     return {

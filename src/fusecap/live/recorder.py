@@ -17,13 +17,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from fusecap.engine.live_setup import LiveSetup
-from fusecap.engine.step import LiveStep
+from fusecap.engine.engine import LiveStep
 from fusecap.errors import InputError
 from fusecap.live.devices.source import SessionClock
 from fusecap.live.status import LiveStatus, RecordingStatus
 from fusecap.recording import RecordingWriter
 from fusecap.recording.setup_json import setup_values
+from fusecap.setup import SessionSetup
 from fusecap.types import CameraImage, CameraSample, Estimate, Event
 
 QUEUE_BYTES = 64 << 20
@@ -56,7 +56,7 @@ class Recorder:
     def __init__(
         self,
         path: Path | str,
-        setup: LiveSetup,
+        setup: SessionSetup,
         clock: SessionClock,
         *,
         from_start: bool = True,

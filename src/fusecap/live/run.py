@@ -22,9 +22,7 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 from fusecap.detect.detector import Detector
-from fusecap.engine.engine import Engine
-from fusecap.engine.live_setup import LiveSetup
-from fusecap.engine.step import LiveStep
+from fusecap.engine.engine import Engine, LiveStep
 from fusecap.live.detection import DetectionLoop
 from fusecap.live.devices.source import Delivery, SessionClock, Source
 from fusecap.live.feed import Feed
@@ -35,6 +33,7 @@ from fusecap.live.latency import CAMERA, SENSOR, LatencyBook
 from fusecap.live.report import LiveReport, subject_reports
 from fusecap.live.solving import LiveEngine, Solving
 from fusecap.live.status import LiveStatus, RecordingStatus, SourceStatus, StreamStatus
+from fusecap.setup import SessionSetup
 from fusecap.types import CameraImage, CameraSample, Command, Event
 
 DELAY_WITH_DETECTOR_S = 0.2
@@ -122,7 +121,7 @@ class LiveRun:
 
     def __init__(
         self,
-        setup: LiveSetup,
+        setup: SessionSetup,
         sources: Sequence[Source],
         detector: Detector | None,
         options: LiveOptions | None = None,

@@ -17,7 +17,7 @@ from typing import Protocol
 
 import numpy as np
 
-from fusecap.engine.step import LiveStep
+from fusecap.engine.engine import LiveStep
 from fusecap.live.devices.source import SessionClock
 from fusecap.live.health import Meter
 from fusecap.live.inbox import Inbox

@@ -22,7 +22,7 @@ from contextlib import suppress
 from functools import partial
 from typing import IO
 
-from fusecap.engine.step import LiveStep
+from fusecap.engine.engine import LiveStep
 from fusecap.errors import InputError
 from fusecap.live.devices.source import SessionClock
 from fusecap.live.latency import LatencyBook

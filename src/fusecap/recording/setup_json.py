@@ -1,4 +1,4 @@
-"""A `LiveSetup` as plain values that JSON holds exactly, and back.
+"""A `SessionSetup` as plain values that JSON holds exactly, and back.
 
 Files are not needed again: cameras, offsets and the sensors' constants are in the values. Of paths
 only the names remain, of addresses no password.
@@ -15,15 +15,15 @@ import numpy as np
 from pydantic import ValidationError
 
 from fusecap.body.landmarks import LANDMARKS, LandmarkOffsets, LandmarkSet
-from fusecap.engine.live_setup import LiveSetup
 from fusecap.errors import InputError
 from fusecap.geometry.camera import Camera, Rig
+from fusecap.setup import SessionSetup
 from fusecap.sources.session import Session
 
 _CAMERA_ARRAYS = {"matrix": (3, 3), "distortion": (5,), "rotation": (3, 3), "translation": (3,)}
 
 
-def setup_values(setup: LiveSetup) -> dict[str, Any]:
+def setup_values(setup: SessionSetup) -> dict[str, Any]:
     """Dicts, lists, texts and numbers."""
     offsets = setup.landmarks.offsets
     return {
@@ -43,13 +43,13 @@ def setup_values(setup: LiveSetup) -> dict[str, Any]:
     }
 
 
-def setup_from_values(values: Mapping[str, Any], file: Path) -> LiveSetup:
+def setup_from_values(values: Mapping[str, Any], file: Path) -> SessionSetup:
     """The setup again; `file` is where it was read, and stands for the session file.
 
     Raises `InputError` for values that make no setup.
     """
     try:
-        return LiveSetup(
+        return SessionSetup(
             session=Session.model_validate(values["session"], context={"file": file}),
             rig=Rig(cameras=tuple(_camera(camera) for camera in values["rig"])),
             landmarks=_landmarks(values["landmarks"]),

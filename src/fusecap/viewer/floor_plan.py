@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fusecap.body.landmarks import LandmarkSet
-from fusecap.engine.step import LiveStep
+from fusecap.engine.engine import LiveStep
 from fusecap.geometry.camera import Camera, Rig
 from fusecap.types import TrackState
 from fusecap.viewer.palette import Rgb, css, escaped

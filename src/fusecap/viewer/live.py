@@ -15,9 +15,9 @@ import numpy as np
 import viser
 from jaxtyping import Float
 
-from fusecap.engine.live_setup import LiveSetup
-from fusecap.engine.step import LiveStep
+from fusecap.engine.engine import LiveStep
 from fusecap.live.status import LiveStatus
+from fusecap.setup import SessionSetup
 from fusecap.streams.target import LOOPBACK
 from fusecap.types import CameraImage, CameraSample, Command, Event
 from fusecap.viewer import tables
@@ -63,7 +63,7 @@ class LiveViewer:
 
     def __init__(
         self,
-        setup: LiveSetup,
+        setup: SessionSetup,
         run: Submitting,
         host: str = LOOPBACK,
         port: int | None = None,

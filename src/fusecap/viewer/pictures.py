@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from fusecap.body.landmarks import LandmarkSet
-from fusecap.engine.step import LiveStep
+from fusecap.engine.engine import LiveStep
 from fusecap.export.overlay import LINKS
 from fusecap.geometry.camera import Camera, Rig
 from fusecap.types import CameraImage, CameraSample

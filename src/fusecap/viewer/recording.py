@@ -8,8 +8,8 @@ from collections.abc import Mapping
 import numpy as np
 import viser
 
-from fusecap.engine.live_setup import LiveSetup
 from fusecap.recording.reader import RecordedEvent, Recording
+from fusecap.setup import SessionSetup
 from fusecap.types import CameraSample
 from fusecap.viewer.figure import Pose
 from fusecap.viewer.floor_plan import FloorDrawing, FloorPlan, standing_places
@@ -25,7 +25,7 @@ _OLD_NS = 500_000_000
 class RecordedDetections:
     """The detections of a recording, thinned out."""
 
-    def __init__(self, recording: Recording, setup: LiveSetup) -> None:
+    def __init__(self, recording: Recording, setup: SessionSetup) -> None:
         self.setup = setup
         self._times_ns: list[list[int]] = [[] for _ in setup.rig.cameras]
         self._people: list[list[np.ndarray]] = [[] for _ in setup.rig.cameras]

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from fusecap.engine.step import LiveStep
+from fusecap.engine.engine import LiveStep
 from fusecap.live.status import Light, LiveStatus, SourceStatus
 from fusecap.types import TrackState
 from fusecap.viewer.palette import Rgb, css, escaped

@@ -53,7 +53,7 @@ from fusecap.errors import InputError
 from fusecap.geometry.camera import Rig
 from fusecap.geometry.similarity import Similarity
 from fusecap.geometry.triangulation import ROBUST_SCALE_PX, triangulate
-from fusecap.setup import scene_of
+from fusecap.setup import setup_of
 from fusecap.sources.session_data import SessionData
 from fusecap.types import Detections, ImuReading
 
@@ -426,7 +426,8 @@ class _Session:
         names = self._landmarks.landmark_names
         wanted = [row for row, (_, far) in enumerate(limbs) if names[far].endswith(_MEASURED_LIMBS)]
         votes, weights = [], []
-        models = {model.name: model for model in scene_of(self.data).subjects}
+        setup = setup_of(self.data.session, self.data.rig, self.data.landmarks)
+        models = {model.name: model for model in setup.subjects}
         stated = {subject.name: subject for subject in self.data.session.subjects}
         for person, name in enumerate(found.rows.names):
             model = models.get(name)
@@ -460,9 +461,9 @@ class _Session:
 
     def _skeleton(self, rig: Rig) -> dict[str, float]:
         """Median held-out distance [px] from solved landmarks per camera; "all" is their median."""
-        data = replace(self.data, rig=rig)
-        instants = _Listed(data, self.detections)
-        take = solve_instants(scene_of(data), instants, progress=self.progress).take
+        setup = setup_of(self.data.session, rig, self.data.landmarks)
+        instants = _Listed(self.data, self.detections)
+        take = solve_instants(setup, instants, progress=self.progress).take
         held_out = [
             moment
             for (instant, _), (_, moment) in zip(self.detections, self.detections, strict=True)

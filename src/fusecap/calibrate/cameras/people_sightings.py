@@ -19,12 +19,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from fusecap.associate.candidates import CandidateOptions
-from fusecap.associate.subjects import Subject
-from fusecap.associate.tracker import Tracker, TrackerOptions
+from fusecap.associate.tracker import TrackerOptions
 from fusecap.batch.solve import Progress
 from fusecap.geometry.camera import Rig
 from fusecap.pipeline import Pipeline, observation_of
-from fusecap.setup import scene_of
+from fusecap.setup import setup_of
 from fusecap.sources.session_data import SessionData
 from fusecap.sources.view_agreement import disagreement_px, without_distortion
 from fusecap.types import Detections, TrackState
@@ -125,20 +124,11 @@ def sight(
 
     `detections` are the instants to follow, with their index.
     """
-    scene = scene_of(replace(data, rig=rig))
+    setup = setup_of(data.session, rig, data.landmarks)
     settings = data.session.settings
     options = replace(gates, max_subjects=settings.max_subjects, volume_m=settings.volume_m)
-    named = [Subject(name=model.name, start_m=model.start_m) for model in scene.subjects]
-    pipeline = Pipeline(
-        rig=rig,
-        landmarks=scene.landmarks,
-        skeleton=scene.skeleton,
-        prior=scene.prior,
-        sorter=Tracker(rig, scene.landmarks, options, named),
-        subjects=scene.subjects,
-        options=scene.options,
-    )
-    count = len(scene.landmarks.landmark_names)
+    pipeline = Pipeline(replace(setup, associate="tracker", tracker=options))
+    count = len(setup.landmarks.landmark_names)
     names: dict[int, str] = {}
     seen: list[tuple[int, int, np.ndarray]] = []
     for done, (instant, moment) in enumerate(detections, start=1):

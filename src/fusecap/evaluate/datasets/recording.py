@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from fusecap.associate.tracker import TrackerOptions
 from fusecap.batch.solve import Progress, Solved, solve_instants
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.body.pose import landmarks_in_world
@@ -19,7 +20,7 @@ from fusecap.body.prior import load_prior
 from fusecap.body.skeleton import PAPER21, Skeleton
 from fusecap.errors import InputError
 from fusecap.geometry.camera import Rig
-from fusecap.setup import Scene, make_sorter
+from fusecap.setup import Setup
 from fusecap.solve.estimator import SubjectModel
 from fusecap.solve.options import SolverOptions, Weights
 from fusecap.sources.keypoint_files import read_keypoints
@@ -137,19 +138,17 @@ class Recording:
     def solve(self, progress: Progress | None = None) -> Solved:
         """The default solve."""
         weights = Weights() if self.floor else Weights(floor=0.0)
-        scene = Scene(
+        setup = Setup(
             rig=self.rig,
             landmarks=self.landmarks,
             skeleton=self.skeleton,
             rate_hz=self.rate_hz,
             subjects=self.subjects,
-            sorter=make_sorter(
-                self.rig, self.landmarks, self.subjects, max_subjects=self.max_subjects
-            ),
+            tracker=TrackerOptions(max_subjects=self.max_subjects),
             prior=load_prior(self.skeleton),
             options=SolverOptions(weights=weights),
         )
-        return solve_instants(scene, self, progress=progress, notes=self.notes)
+        return solve_instants(setup, self, progress=progress, notes=self.notes)
 
 
 def read_views(
