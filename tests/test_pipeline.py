@@ -61,6 +61,6 @@ def test_a_lone_camera_follows_one_person_and_no_more(data, setup):
         detections = instants.detections(instant)
         step = pipeline.step(replace(detections, people=detections.people[:1]), {})
         counts.add(len(step.estimates))
-    assert counts == {0, 1}
+    assert max(counts) == 1
     with pytest.raises(SessionError, match="one camera cannot tell 2 people apart"):
         Pipeline(replace(alone, tracker=replace(tracker, max_subjects=2)))

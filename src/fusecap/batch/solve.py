@@ -14,7 +14,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -30,6 +30,7 @@ Progress = Callable[[str, int, int], None]
 """Called with (what is being done, instants done, instants in all)."""
 
 
+@runtime_checkable
 class Instants(Protocol):
     """Recorded measurements on the solve's instants."""
 
