@@ -24,15 +24,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fusecap.body.landmarks import landmark_set_named
+from fusecap.calibrate.imus.checks import Worn, sensor_rotations
 from fusecap.calibrate.imus.identify import identify
 from fusecap.calibrate.imus.joint_centres import landmarks_seen
-from fusecap.calibrate.imus.motion import (
-    SensorCalibration,
-    Worn,
-    calibrate_subject,
-    sensor_rotations,
-)
+from fusecap.calibrate.imus.motion import calibrate_subject
 from fusecap.calibrate.imus.reference import ReferenceMotion, reference_motion
+from fusecap.calibrate.imus.sensor_report import SensorCalibration
 from fusecap.calibrate.imus.tpose import TPose
 from fusecap.evaluate.imu_noise import IMUS_13
 from fusecap.evaluate.simulated_solve import solve_simulation
@@ -197,9 +194,9 @@ def main() -> None:
                     continue
                 sensors += 1
                 scores.append(mean / np.array(sensor.sigma_deg))
-                if sensor.verdict in ("wrong bone", "moved", "poor"):
+                if not sensor.usable:
                     alarms += 1
-                    print(f"false alarm: {sensor.bone}, {sensor.verdict}: {sensor.remedy[:60]}")
+                    print(f"false alarm: {sensor.bone}, {sensor.fault}: {sensor.remedy[:60]}")
         if arguments.no_faults:
             continue
         for pair in (("left_shank", "right_shank"), ("left_forearm", "right_forearm")):
@@ -209,8 +206,8 @@ def main() -> None:
         carried[slipped] = turned(carried[slipped], rng.standard_normal(3))
         turns += 1
         again = calibrate_subject(reference, carried, seen).sensors
-        turns_found += again[slipped].verdict == "moved"
-        print(f"{simulation.people[0].name}: turned {IMUS_13[slipped]}: {again[slipped].verdict}")
+        turns_found += again[slipped].fault == "moved"
+        print(f"{simulation.people[0].name}: turned {IMUS_13[slipped]}: {again[slipped].fault}")
     print("degrees, median and worst: whole rotation, across the length; the same with a T-pose")
     for bone in IMUS_13:
         cells = [

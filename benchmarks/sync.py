@@ -242,7 +242,7 @@ def pose2sim(data: Path) -> None:
                 print(
                     f"{trial}, dropped {dropped}: off by {np.round(error, 2)} frames "
                     f"({np.round(error - unshifted, 2)} from unshifted),",
-                    ", ".join(row.verdict for row in found.rows),
+                    ", ".join(row.word for row in found.rows),
                     flush=True,
                 )
 

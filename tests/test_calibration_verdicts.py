@@ -15,6 +15,7 @@ from fusecap.calibrate.cameras.board import CHECKERBOARD, Board
 from fusecap.calibrate.cameras.bundle_adjustment import adjust, stack_views
 from fusecap.calibrate.cameras.people import CameraChange, Fit, PeopleCalibration
 from fusecap.calibrate.cameras.report import CameraReport, ScaleCheck, verdict_of
+from fusecap.calibrate.verdict import Verdict, worst
 from fusecap.errors import CalibrationError, InputError
 from fusecap.geometry.projection_derivatives import PARAMETERS
 from fusecap.sources.detection_files import DetectionRecord, VideoMark, read_record
@@ -55,6 +56,12 @@ def verdict(cameras=(FINE, FINE, FINE), **changes):
         "resamples": 10,
     }
     return verdict_of(cameras=cameras, **fine | changes)
+
+
+@given(st.lists(st.sampled_from(list(Verdict))))
+def test_worst_verdict_decides(verdicts):
+    order = [word for word in ("poor", "usable", "good") if word in verdicts]
+    assert worst(verdicts) == (order or ["good"])[0]
 
 
 def test_rig_without_a_flaw_is_good():

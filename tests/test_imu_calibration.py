@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from fusecap.body.landmarks import landmark_set_named
 from fusecap.body.skeleton import PAPER21
 from fusecap.calibrate.imus.changes import find_change
+from fusecap.calibrate.imus.checks import Worn, sensor_rotations
 from fusecap.calibrate.imus.fit import (
     HeadingPrior,
     Pairs,
@@ -22,7 +23,7 @@ from fusecap.calibrate.imus.fit import (
 )
 from fusecap.calibrate.imus.identify import identify
 from fusecap.calibrate.imus.joint_centres import SeenLandmarks, _Problem, fit_together
-from fusecap.calibrate.imus.motion import Worn, calibrate_subject, sensor_rotations
+from fusecap.calibrate.imus.motion import calibrate_subject
 from fusecap.calibrate.imus.reference import reference_motion
 from fusecap.calibrate.imus.speeds import lag_s
 from fusecap.calibrate.imus.tpose import look_at_tpose
@@ -195,7 +196,7 @@ def test_mountings_come_back_from_perfect_sensors(reference):
         w, x, y, z = sensor.bone_from_imu_wxyz
         mounting = Rotation.from_quat([x, y, z, w]).as_matrix()
         assert sensor.held_out_deg < 2.5, "the heading others have pulls a little"
-        assert sensor.usable, sensor.verdict
+        assert sensor.usable, sensor.fault
         if sensor.bone != "hips":
             assert angle_deg(mounting, imus.mounting[index]) < 3.0
     assert max(found.sensors[1].sigma_deg) == found.sensors[1].sigma_deg[0] > 20, "a forearm's turn"
@@ -211,9 +212,9 @@ def test_swapped_sensors_are_both_named(reference):
         replace(worn[5], track=worn[4].track),
     ]
     found = calibrate_subject(reference, swapped).sensors
-    assert [sensor.verdict for sensor in found[4:]] == ["wrong bone"] * 2
+    assert [(sensor.verdict, sensor.fault) for sensor in found[4:]] == [("poor", "wrong bone")] * 2
     assert "left_shank.csv' is stated on left_shank but moves like right_shank" in found[4].remedy
-    assert all(sensor.verdict != "wrong bone" for sensor in found[:4])
+    assert all(sensor.fault != "wrong bone" for sensor in found[:4])
 
 
 @pytest.mark.slow
@@ -234,7 +235,7 @@ def test_sensor_turned_half_way_is_noticed_where_it_happened(reference):
     quaternion[300:] = np.roll(later.as_quat(canonical=True), 1, axis=1)
     worn[2] = replace(worn[2], track=replace(worn[2].track, orientation_wxyz=quaternion))
     found = calibrate_subject(reference, worn).sensors
-    assert [sensor.verdict == "moved" for sensor in found] == [i == 2 for i in range(len(BONES))]
+    assert [sensor.fault == "moved" for sensor in found] == [i == 2 for i in range(len(BONES))]
     assert found[2].change is not None
     assert found[2].change.time_s == pytest.approx(5.0, abs=2.1)
 

@@ -291,7 +291,7 @@ def test_command_writes_a_calibration_that_the_session_can_use(rng, tmp_path):
     edit(path, "calibration.toml", "refined.toml")
     out.with_suffix(".png").unlink()
     again = CliRunner().invoke(app, [*command[:-1], str(tmp_path / "again.toml")])
-    assert "verdict" in again.stdout and "known to" in again.stdout
+    assert "calibration: " in again.stdout and "known to" in again.stdout
 
 
 def test_command_refuses_boards_and_people_at_once():

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from fusecap.body.landmarks import landmark_set_named
 from fusecap.calibrate.sync import session as sync_session
+from fusecap.calibrate.sync import session_imus
 from fusecap.calibrate.sync.cameras import synchronise_cameras
 from fusecap.calibrate.sync.curves import clustered_covariance
 from fusecap.calibrate.sync.imus import Filmed, Worn, imu_clock
@@ -233,7 +234,7 @@ def test_sensors_of_one_subject_may_be_on_different_clocks():
     offsets_s = [0.5, 0.5, 1.3, 1.3]
     subject, sensors, person = several_clocks(offsets_s)
     tracks = [plain_track(worn.times_s) for worn in sensors]
-    found = sync_session._subject_clocks(subject, tracks, sensors, person, 3.0, None)
+    found = session_imus.subject_clocks(subject, tracks, sensors, person, 3.0, None)
     assert sorted(len(clock.bones) for clock in found) == [2, 2]
     by_bone = {bone: clock.offset_s for clock in found for bone in clock.bones}
     for worn, offset_s in zip(sensors, offsets_s, strict=True):
@@ -263,9 +264,9 @@ def test_sensors_are_given_to_the_people_they_fit(tmp_path):
     session = parse_session(write_small(tmp_path, frames=10))
     session = session.model_copy(update={"subjects": tuple(subjects)})
     starts_m = {"ben": (0.5, 0.5), "anna": (-1.0, 0.0)}
-    notes: list[str] = []
-    found = sync_session._wearers(session, subjects, worn, people, starts_m, 2.0, notes)
+    found = session_imus.wearers(session, subjects, worn, people, 2.0)
     assert [person and person.name for person in found] == ["ben", "anna"]
+    notes = session_imus.called_otherwise(subjects, found, starts_m)
     assert len(notes) == 2 and "add start_m = [0.5, 0.5] to 'anna'" in notes[0]
 
 
@@ -326,19 +327,19 @@ def small(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("motion", "verdict", "said"),
+    ("motion", "state", "said"),
     [
         (standing, "not found", "nobody moves"),
         (repeating, "ambiguous", "the motion repeats itself"),
     ],
 )
-def test_motion_that_cannot_tell_is_refused(small, monkeypatch, motion, verdict, said):
+def test_motion_that_cannot_tell_is_refused(small, monkeypatch, motion, state, said):
     some = tracks(ring(4), motion, np.zeros(4), [30] * 4)
     monkeypatch.setattr(sync_session, "open_keypoints", lambda *_: tuple(some))
     found = synchronise(parse_session(small), max_offset_s=3.0)
     assert not found.complete
     for row in found.rows[1:]:
-        assert row.verdict == verdict and said in row.said
+        assert row.state == state and row.verdict is None and said in row.said
     assert all(name == found.reference for name in found.clocks.cameras)
 
 
@@ -347,7 +348,7 @@ def test_offset_beyond_the_range_is_not_made_up(small, monkeypatch):
     some = tracks(ring(4), walking, [0, 0, 0, 2.0], [30] * 4)
     monkeypatch.setattr(sync_session, "open_keypoints", lambda *_: tuple(some))
     row = synchronise(parse_session(small), max_offset_s=0.5).rows[3]
-    assert row.verdict == "not found" and "--max-offset" in row.said
+    assert row.state == "not found" and "--max-offset" in row.said
 
 
 @pytest.mark.slow
@@ -357,7 +358,7 @@ def test_camera_that_sees_nobody_is_named(small, monkeypatch):
     monkeypatch.setattr(sync_session, "open_keypoints", lambda *_: tuple(some))
     rows = synchronise(parse_session(small), max_offset_s=1.0).rows
     assert "nobody is seen" in rows[2].said
-    assert rows[1].verdict in ("good", "fair") and rows[3].verdict in ("good", "fair")
+    assert rows[1].verdict in ("good", "usable") and rows[3].verdict in ("good", "usable")
 
 
 def test_two_sensors_on_one_bone_are_refused_with_words(tmp_path):

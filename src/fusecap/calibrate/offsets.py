@@ -48,6 +48,7 @@ from scipy.optimize import linear_sum_assignment
 from fusecap.batch.solve import Progress, SessionInstants, solve_instants
 from fusecap.body.landmarks import LANDMARKS, LandmarkOffsets, LandmarkSet
 from fusecap.body.pose import landmarks_in_world
+from fusecap.calibrate.verdict import Verdict
 from fusecap.errors import InputError
 from fusecap.evaluate.metrics import Summary, summarize
 from fusecap.geometry.camera import Rig
@@ -162,6 +163,25 @@ class OffsetCalibration:
     """Distance of keypoints from the projected landmarks on instants that were not used, with the
     offsets that the session had."""
     held_out_after_px: Summary
+
+    @property
+    def verdict(self) -> Verdict:
+        """Poor where held-out instants are not explained better, usable where rounds ran out."""
+        if not self.held_out_after_px.median < self.held_out_before_px.median:
+            return Verdict.POOR
+        return Verdict.GOOD if self.converged else Verdict.USABLE
+
+    @property
+    def advice(self) -> tuple[str, ...]:
+        """What keeps it from being good."""
+        said = []
+        if self.verdict is Verdict.POOR:
+            said.append(
+                "the held-out instants are not explained better than before; do not use these"
+            )
+        if not self.converged:
+            said.append(f"the last round still moved offsets by {self.step_mm[-1]:.1f} mm")
+        return tuple(said)
 
 
 def calibrate_session(

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fusecap.cli import calibrate_from_people
-from fusecap.cli.calibrate_intrinsics import (
-    Every,
+from fusecap.cli.calibrate_intrinsics import Every
+from fusecap.cli.calibrations import (
     named_sources,
     plain,
-    print_advice,
+    print_files,
+    print_verdict,
     write_report,
 )
 from fusecap.cli.common import Json, console, err, print_json, progress
@@ -157,8 +158,7 @@ def extrinsics(
         print_json(as_dict | {"files": [str(file) for file in files]})
         return
     _print(result, refine=moving)
-    for file in files:
-        console.print(f"wrote {file}", soft_wrap=True)
+    print_files(files)
     if origin_frame is None:
         console.print(
             "the first camera is the world; place it in the room: fusecap calibrate world "
@@ -283,4 +283,4 @@ def _print(result: RigCalibration, *, refine: bool) -> None:
             markup=False,
             soft_wrap=True,
         )
-    print_advice(report.verdict, report.advice, "calibration")
+    print_verdict("calibration", report.verdict, report.advice)

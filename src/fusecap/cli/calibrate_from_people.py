@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from fusecap.cli.common import check_choice, console, err, print_json, progress
+from fusecap.cli.calibrations import plain, print_files, print_verdict
+from fusecap.cli.common import check_choice, console, print_json, progress
 
 if TYPE_CHECKING:
     from fusecap.calibrate.cameras.people import PeopleCalibration
@@ -51,8 +52,7 @@ def from_people(
         print_json(_as_json(found, files))
     else:
         _print_report(found)
-        for path in files:
-            console.print(f"wrote {path}", markup=False, soft_wrap=True)
+        print_files(files)
         if found.improved:
             console.print(
                 f'use it: under [session] calibration = "{out.name}" and up = "y"',
@@ -73,22 +73,13 @@ def _origin(found: PeopleCalibration, session: str) -> list[str]:
 
 
 def _as_json(found: PeopleCalibration, files: Sequence[Path]) -> dict[str, object]:
-    from dataclasses import asdict, fields, replace
+    from dataclasses import asdict, replace
 
     from fusecap.geometry.camera import Rig
 
-    plain = asdict(replace(found, rig=Rig(cameras=()), residuals_px={}))
-    kept = {f.name for f in fields(found)} - {"rig", "residuals_px"}
-    report = {name: _no_nan(value) for name, value in plain.items() if name in kept}
-    return report | {"files": [str(path) for path in files]}
-
-
-def _no_nan(value: object) -> object:
-    if isinstance(value, dict):
-        return {key: _no_nan(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_no_nan(item) for item in value]
-    return None if isinstance(value, float) and value != value else value
+    report = asdict(replace(found, rig=Rig(cameras=()), residuals_px={}))
+    del report["rig"], report["residuals_px"]
+    return plain(report) | {"verdict": found.verdict, "files": [str(path) for path in files]}
 
 
 def _change(before: float, after: float) -> str:
@@ -140,13 +131,11 @@ def _print_report(found: PeopleCalibration) -> None:
             + ", ".join(f"{c.name} {100 * (c.focal_share - 1):+.1f} %" for c in found.cameras),
             soft_wrap=True,
         )
-    for note in found.notes:
-        err.print("[yellow]note[/] ", end="")
-        err.print(note, markup=False, soft_wrap=True)
-    verdict = "better than before" if found.improved else "not better: keep the old calibration"
     console.print(
-        f"verdict: {verdict}; all cameras, held out: median {found.before.median_px:.1f} -> "
+        f"  {'better than before' if found.improved else 'not better: keep the old calibration'}; "
+        f"all cameras, held out: median {found.before.median_px:.1f} -> "
         f"{found.after.median_px:.1f} px, 90 % {found.before.p90_px:.1f} -> "
         f"{found.after.p90_px:.1f} px",
         soft_wrap=True,
     )
+    print_verdict("calibration", found.verdict, found.notes)

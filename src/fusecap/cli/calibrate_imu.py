@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from fusecap.cli.calibrations import coloured, print_files
 from fusecap.cli.common import (
     Json,
     SessionPath,
@@ -137,14 +138,13 @@ def _print_subject(found: SubjectCalibration) -> None:
     for column in table.columns:
         column.no_wrap = True
     for sensor in found.sensors:
-        colour = "green" if sensor.verdict == "good" else "yellow" if sensor.usable else "red"
         table.add_row(
             sensor.bone,
             " ".join(f"{value:5.2f}" for value in sensor.bone_from_imu_wxyz),
             f"{sensor.heading_deg:.1f}",
             " ".join(f"{min(value, 180):2.0f}" for value in sensor.sigma_deg),
             f"{sensor.held_out_deg:.1f}",
-            f"[{colour}]{sensor.verdict}[/]",
+            coloured(sensor.verdict),
         )
     console.print(table)
     console.print(
@@ -176,9 +176,11 @@ def _print_subject(found: SubjectCalibration) -> None:
     advice: dict[tuple[str, str], list[str]] = {}
     for sensor in found.sensors:
         if sensor.remedy:
-            advice.setdefault((sensor.verdict, sensor.remedy), []).append(sensor.bone)
-    for (verdict, remedy), bones in advice.items():
-        err.print(f"[yellow]{verdict}[/] {', '.join(bones)}: {remedy}", soft_wrap=True)
+            why = f"{sensor.fault}; {sensor.remedy}"
+            advice.setdefault((coloured(sensor.verdict), why), []).append(sensor.bone)
+    for (verdict, why), bones in advice.items():
+        err.print(f"{verdict} {', '.join(bones)}:", end=" ")
+        err.print(why, markup=False, soft_wrap=True)
     for sensor in found.skipped:
         err.print(
             f"[red]not calibrated[/] {sensor.bone} ({sensor.file}): {sensor.reason}",
@@ -199,21 +201,21 @@ def _report_identities(found: dict[str, tuple[Identity, ...]], as_json: bool) ->
         return
     for name, identities in found.items():
         console.print(f"[bold]{name}[/]")
-        table = Table("stated", "moves like", "margin", "runner-up", "speed corr.", "verdict")
+        table = Table("stated", "moves like", "margin", "runner-up", "speed corr.", "is it?")
         for each in identities:
             if each.margin <= SURE:
-                verdict = f"[yellow]unsure: {each.found} and {each.runner_up} move alike here[/]"
+                told = f"[yellow]unsure: {each.found} and {each.runner_up} move alike here[/]"
             elif each.found != each.stated:
-                verdict = f'[red]write bone = "{each.found}"[/]'
+                told = f'[red]write bone = "{each.found}"[/]'
             else:
-                verdict = "[green]as stated[/]"
+                told = "[green]as stated[/]"
             table.add_row(
                 each.stated,
                 each.found,
                 f"{each.margin:.2f}",
                 each.runner_up,
                 f"{each.speed_correlation:.2f}",
-                verdict,
+                told,
             )
         console.print(table, soft_wrap=True)
     console.print(
@@ -250,16 +252,16 @@ def _report_tpose(found: list[tuple[CalibratedImu, TPose]], out: Path, as_json: 
 def _print_tpose(found: list[tuple[CalibratedImu, TPose]]) -> None:
     from rich.table import Table
 
-    table = Table("subject", "bone", "R_ib w, x, y, z", "moved deg", "gravity deg", "verdict")
+    table = Table("subject", "bone", "R_ib w, x, y, z", "moved deg", "gravity deg", "stood")
     for imu, pose in found:
-        verdict = "[red]" + "; ".join(pose.complaints) + "[/]" if pose.complaints else "still"
+        stood = "[red]" + "; ".join(pose.complaints) + "[/]" if pose.complaints else "still"
         table.add_row(
             imu.subject,
             imu.bone,
             " ".join(f"{value:6.3f}" for value in imu.bone_from_imu_wxyz),
             f"{pose.moved_deg:.1f}",
             f"{pose.gravity_deg:.1f}",
-            verdict,
+            stood,
         )
     console.print(table, soft_wrap=True)
     if any(pose.complaints for _, pose in found):
@@ -286,8 +288,7 @@ def _write(imus: list[CalibratedImu], out: Path, origin: str) -> list[Path]:
 
 
 def _print_files(files: list[Path], imus: list[Any], out: Path) -> None:
-    for file in files:
-        console.print(f"wrote {file}", soft_wrap=True)
+    print_files(files)
     if imus:
         console.print(f'use it: imu_calibration = "{out.name}" under \\[session]', soft_wrap=True)
     else:

@@ -7,6 +7,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from fusecap.cli.calibrations import (
+    named_sources,
+    plain,
+    print_files,
+    print_verdict,
+    write_report,
+)
 from fusecap.cli.common import Json, check_choice, console, err, print_json, progress
 
 if TYPE_CHECKING:
@@ -91,49 +98,7 @@ def intrinsics(
         print_json(report | {"files": [str(file) for file in files]})
         return
     _print(lenses)
-    for file in files:
-        console.print(f"wrote {file}", soft_wrap=True)
-
-
-def named_sources(sources: list[str]) -> dict[str, str]:
-    """CAMERA=SOURCE arguments by camera; misuse exits with 2."""
-    named: dict[str, str] = {}
-    for text in sources:
-        name, equals, source = text.partition("=")
-        if not (equals and name and source):
-            raise typer.BadParameter(
-                f"'{text}': expected CAMERA=SOURCE, such as left=videos/left.mp4",
-                param_hint="SOURCES",
-            )
-        if name in named:
-            raise typer.BadParameter(f"camera '{name}' is given twice", param_hint="SOURCES")
-        named[name] = source
-    return named
-
-
-def write_report(out: Path, report: dict[str, Any]) -> Path:
-    """The report beside the calibration, as `<name>_report.json`."""
-    import json
-
-    from fusecap.files import written_whole
-
-    path = out.with_name(f"{out.stem}_report.json")
-    with written_whole(path) as file:
-        file.write(json.dumps(report, indent=2).encode())
-    return path
-
-
-def plain(value: Any) -> Any:
-    """For JSON: arrays as lists, numbers that are not finite as null."""
-    import math
-
-    if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if hasattr(value, "tolist"):
-        return plain(value.tolist())
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    print_files(files)
 
 
 def lens_report(lens: Intrinsics) -> dict[str, Any]:
@@ -151,14 +116,6 @@ def lens_report(lens: Intrinsics) -> dict[str, Any]:
     fields = asdict(lens)
     del fields["camera"]
     return plain(report | fields)
-
-
-def print_advice(verdict: str, advice: tuple[str, ...], what: str) -> None:
-    """The verdict on stdout, and on stderr what to do about one that is not good."""
-    colour = {"good": "green", "usable": "yellow", "poor": "red"}[verdict]
-    console.print(f"{what}: [{colour}]{verdict}[/]")
-    for remedy in advice:
-        err.print(f"{what}: {remedy}", markup=False, soft_wrap=True)
 
 
 def _print(lenses: list[Intrinsics]) -> None:
@@ -191,4 +148,4 @@ def _print(lenses: list[Intrinsics]) -> None:
                 markup=False,
                 soft_wrap=True,
             )
-        print_advice(lens.verdict, lens.advice, f"camera '{lens.camera.name}'")
+        print_verdict(f"camera '{lens.camera.name}'", lens.verdict, lens.advice)

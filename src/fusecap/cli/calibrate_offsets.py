@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fusecap.cli.common import Json, SessionPath, console, err, print_json, progress
+from fusecap.cli.calibrations import print_verdict
+from fusecap.cli.common import Json, SessionPath, console, print_json, progress
 
 if TYPE_CHECKING:
     from fusecap.calibrate.offsets import OffsetCalibration
@@ -47,7 +48,12 @@ def offsets(
     with written_whole(out) as file:
         file.write(offsets_toml(found.landmarks, origin=origin(found, truth)).encode())
     if as_json:
-        report = asdict(found) | {"landmarks": found.landmarks.name, "file": str(out)}
+        report = asdict(found) | {
+            "landmarks": found.landmarks.name,
+            "verdict": found.verdict,
+            "advice": found.advice,
+            "file": str(out),
+        }
         print_json(report)
         return
     _print_report(found)
@@ -58,8 +64,6 @@ def _print_report(found: OffsetCalibration) -> None:
     from rich.table import Table
 
     how = "the truth's poses" if found.with_truth else f"{len(found.step_mm)} rounds of solves"
-    if found.step_mm and not found.converged:
-        how += f" (the last one still moved offsets by {found.step_mm[-1]:.1f} mm)"
     console.print(f"{found.person_frames} person-frames, {how}")
     table = Table("landmark", "x, y, z on its bone mm", "moved", "spread", "samples")
     for column in table.columns:
@@ -76,14 +80,9 @@ def _print_report(found: OffsetCalibration) -> None:
         )
     console.print(table)
     before, after = found.held_out_before_px, found.held_out_after_px
-    if not after.median < before.median:
-        err.print(
-            "[yellow]note[/] the held-out instants are not explained better than before; "
-            "do not use these offsets",
-            soft_wrap=True,
-        )
     console.print(
         f"  held-out instants  reprojection {before.median:.2f} -> {after.median:.2f} px median, "
         f"{before.mean:.2f} -> {after.mean:.2f} px mean, {after.count} keypoints",
         soft_wrap=True,
     )
+    print_verdict("offsets", found.verdict, found.advice)

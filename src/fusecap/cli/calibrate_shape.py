@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fusecap.cli.common import Json, SessionPath, console, err, print_json, progress
+from fusecap.calibrate.verdict import Verdict
+from fusecap.cli.calibrations import print_files, print_verdict
+from fusecap.cli.common import Json, SessionPath, console, print_json, progress
 
 if TYPE_CHECKING:
     from fusecap.calibrate.shape import MeasuredBody, ShapeCalibration
@@ -57,6 +59,7 @@ def shape(
     picture = out.with_suffix(".png")
     plot_bodies(found.bodies, picture)
     problems = _problems(found)
+    verdict = Verdict.POOR if problems else Verdict.GOOD
     if as_json:
         bodies = [
             {key: value for key, value in vars(body).items() if key not in ("shape", "bones")}
@@ -68,6 +71,7 @@ def shape(
                 "bodies": bodies,
                 "held_out_before_px": asdict(found.held_out_before_px),
                 "held_out_after_px": asdict(found.held_out_after_px),
+                "verdict": verdict,
                 "problems": problems,
                 "files": [str(out), str(picture)],
             }
@@ -81,10 +85,8 @@ def shape(
         f"{before.mean:.2f} -> {after.mean:.2f} px mean, {after.count} keypoints",
         soft_wrap=True,
     )
-    for problem in problems:
-        err.print("[yellow]poor[/] ", end="")
-        err.print(problem, markup=False, soft_wrap=True)
-    console.print(f"wrote {out}\nwrote {picture}", markup=False, soft_wrap=True)
+    print_verdict("bodies", verdict, problems)
+    print_files([out, picture])
     console.print("use it: copy height_m and bone_lengths_m into the session's \\[\\[subject]]")
 
 

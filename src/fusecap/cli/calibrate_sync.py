@@ -11,7 +11,8 @@ from fusecap.cli.common import Json, SessionPath, console, err, print_json, prog
 from fusecap.errors import InputError
 
 if TYPE_CHECKING:
-    from fusecap.calibrate.sync.session import Row, Synchronisation
+    from fusecap.calibrate.sync.clock_rows import ClockRow
+    from fusecap.calibrate.sync.session import Synchronisation
 
 EXAMPLE = "Example: fusecap calibrate sync recordings/duo --write --plot recordings/duo/sync.png"
 
@@ -120,7 +121,7 @@ def _print_report(found: Synchronisation) -> None:
     for column in table.columns[1:4]:
         column.justify = "right"
     for row in found.rows:
-        table.add_row(_label(row), *_numbers(row), row.verdict)
+        table.add_row(_label(row), *_numbers(row), row.word)
     console.print(table)
     console.print(
         "  session time = own time + offset: a positive offset means that the clock's zero is that "
@@ -145,19 +146,19 @@ def _print_report(found: Synchronisation) -> None:
         err.print(f"[yellow]note[/] {note}", soft_wrap=True)
     for row in found.rows:
         if row.said:
-            err.print(f"[yellow]{row.verdict}[/] {_label(row)}: {row.said}", soft_wrap=True)
+            err.print(f"[yellow]{row.word}[/] {_label(row)}: {row.said}", soft_wrap=True)
 
 
-def _label(row: Row) -> str:
+def _label(row: ClockRow) -> str:
     if row.kind == "camera":
         return f"camera '{row.name}'"
     some = row.sensors[0] if len(row.sensors) == 1 else f"{len(row.sensors)} sensors"
     return f"imu '{row.name}', {some}"
 
 
-def _numbers(row: Row) -> tuple[str, str, str]:
+def _numbers(row: ClockRow) -> tuple[str, str, str]:
     offset = "-" if row.offset_s is None else f"{1e3 * row.offset_s:+.1f}"
-    error = "-" if row.error_s is None or row.verdict == "reference" else f"{1e3 * row.error_s:.1f}"
+    error = "-" if row.error_s is None or row.state == "reference" else f"{1e3 * row.error_s:.1f}"
     if row.drift_ppm is None or row.drift_error_ppm is None:
         return offset, error, "-"
     drift = f"{0.06 * row.drift_ppm:+.2f} ± {0.06 * row.drift_error_ppm:.2f}"

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from fusecap.cli.common import Json, check_choice, console, err, print_json
+from fusecap.calibrate.verdict import Verdict
+from fusecap.cli.calibrations import print_files, print_verdict
+from fusecap.cli.common import Json, check_choice, console, print_json
 from fusecap.cli.lengths import length_m, named
 
 if TYPE_CHECKING:
@@ -297,6 +299,7 @@ def _report(
         "found_scale": placement.found_scale,
         "imu_spread_m_s2": imu.spread_m_s2 if imu else None,
         "camera_position_m": {c.name: c.position_in_world.tolist() for c in result.cameras},
+        "verdict": Verdict.POOR if problems else Verdict.GOOD,
         "problems": problems,
         "files": [str(path) for path in files],
     }
@@ -329,13 +332,8 @@ def _print(report: dict[str, Any]) -> None:
             markup=False,
             soft_wrap=True,
         )
-    for problem in report["problems"]:
-        err.print("[yellow]poor[/] ", end="")
-        err.print(problem, markup=False, soft_wrap=True)
-    if not report["problems"]:
-        console.print("good: nothing contradicts this world")
-    for path in report["files"]:
-        console.print(f"wrote {path}", markup=False, soft_wrap=True)
+    print_verdict("world", report["verdict"], report["problems"])
+    print_files(report["files"])
 
 
 def _print_residual(residual: dict[str, Any]) -> None:

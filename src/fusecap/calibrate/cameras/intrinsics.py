@@ -38,6 +38,7 @@ from fusecap.calibrate.cameras.robust import (
     robust_scale_px,
     view_rms_px,
 )
+from fusecap.calibrate.verdict import Marks, Verdict
 from fusecap.errors import CalibrationError
 from fusecap.geometry.camera import Camera
 from fusecap.geometry.projection_derivatives import PARAMETERS
@@ -113,8 +114,7 @@ class Intrinsics:
     centre_spread_px: float
     """The same of the principal point."""
     resamples: int
-    verdict: str
-    """good, usable or poor."""
+    verdict: Verdict
     advice: tuple[str, ...]
     """What keeps it from being better, and what to record."""
 
@@ -181,11 +181,11 @@ def calibrate_intrinsics(
         if len(centre) > 1
         else np.nan,
         resamples=len(focal),
-        verdict="",
+        verdict=Verdict.GOOD,
         advice=(),
     )
-    verdict, advice = _verdict(result)
-    return replace(result, verdict=verdict, advice=advice)
+    marks = _marks(result)
+    return replace(result, verdict=marks.verdict, advice=tuple(marks.advice))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -354,27 +354,19 @@ def _empty_edges(cells: np.ndarray) -> list[str]:
     return [name for name, part in edges.items() if (part > 0).mean() < 0.25]
 
 
-def _verdict(found: Intrinsics) -> tuple[str, tuple[str, ...]]:
-    """The worst of all marks, and a remedy for each that is not good."""
+def _marks(found: Intrinsics) -> Marks:
     camera = found.camera
     scale = camera.pixel_scale
     spread = found.focal_spread_px / camera.matrix[0, 0]
-    marks, advice = [0], []
-
-    def mark(value: float | int, good: float | int, poor: float | int, remedy: str) -> None:
-        level = 0 if value <= good else 1 if value <= poor else 2
-        marks.append(level)
-        if level:
-            advice.append(remedy)
-
+    marks = Marks()
     used = sum(not image.left_out for image in found.images)
-    mark(
+    marks.mark(
         -used,
         -ENOUGH_IMAGES,
         -FEW_IMAGES,
         f"{used} images are few: use {ENOUGH_IMAGES} to 40 that differ",
     )
-    mark(
+    marks.mark(
         found.held_out_px * scale,
         _GOOD_PX,
         _POOR_PX,
@@ -382,14 +374,14 @@ def _verdict(found: Intrinsics) -> tuple[str, tuple[str, ...]]:
         "equal, images sharp and focus and zoom locked",
     )
     empty = _empty_edges(found.cells)
-    mark(
+    marks.mark(
         1 - (min(found.coverage, _NOT_ALL_EDGES) if empty else found.coverage),
         1 - _GOOD_COVERAGE,
         1 - _POOR_COVERAGE,
         f"the board covered {100 * found.coverage:.0f} % of the image: record it also near the "
         f"{', '.join(empty) or 'edges'}",
     )
-    mark(
+    marks.mark(
         -found.tilt_deg,
         -_TILTED_DEG,
         -_TILTED_DEG / 2,
@@ -398,14 +390,14 @@ def _verdict(found: Intrinsics) -> tuple[str, tuple[str, ...]]:
     )
     if not np.isfinite(spread):
         spread = np.inf
-    mark(
+    marks.mark(
         spread,
         _GOOD_FOCAL,
         _POOR_FOCAL,
         f"the focal length varies by {100 * spread:.1f} % with the choice of images: record more "
         "tilted boards, close to the camera",
     )
-    return ("good", "usable", "poor")[max(marks)], tuple(advice)
+    return marks
 
 
 def _corners(shots: Sequence[Shot], kept: Sequence[int], board: Board) -> Corners:

@@ -49,6 +49,7 @@ from fusecap.calibrate.cameras.people_adjust import (
 from fusecap.calibrate.cameras.people_gauge import align, gauge_free, motions
 from fusecap.calibrate.cameras.people_sightings import Sightings, roughness, sight, stride_of
 from fusecap.calibrate.offsets import reprojection_error_px
+from fusecap.calibrate.verdict import Verdict
 from fusecap.errors import InputError
 from fusecap.geometry.camera import Rig
 from fusecap.geometry.similarity import Similarity
@@ -168,9 +169,16 @@ class PeopleCalibration:
     feet_m: float
     """Height of the lowest tenth of foot keypoints above the floor of the new world."""
     notes: tuple[str, ...]
-    """What makes the result poor, with its remedy."""
+    """What keeps the result from being good, with its remedy."""
     residuals_px: Mapping[str, tuple[np.ndarray, np.ndarray]] = field(repr=False)
     """Per camera the held-out residuals (n, 2) before and after, for a picture."""
+
+    @property
+    def verdict(self) -> Verdict:
+        """Poor where the old calibration is to be kept."""
+        if not self.improved:
+            return Verdict.POOR
+        return Verdict.USABLE if self.notes else Verdict.GOOD
 
 
 def refine_from_people(

@@ -16,6 +16,7 @@ from fusecap.calibrate.cameras.board import Board
 from fusecap.calibrate.cameras.board_views import CameraShots
 from fusecap.calibrate.cameras.extrinsics import HeldOut, Repeatability, ScaleCheck, Solution
 from fusecap.calibrate.cameras.intrinsics import Intrinsics, coverage_cells
+from fusecap.calibrate.verdict import Marks, Verdict
 from fusecap.errors import CalibrationError
 from fusecap.files import written_whole
 from fusecap.geometry.camera import REFERENCE_WIDTH_PX, Camera
@@ -88,7 +89,7 @@ class RigReport:
     resamples: int
     rig_size_m: float
     """The largest distance between two cameras."""
-    verdict: str
+    verdict: Verdict
     advice: tuple[str, ...]
 
 
@@ -230,21 +231,14 @@ def verdict_of(
     instants: int,
     left_out: float,
     resamples: int,
-) -> tuple[str, tuple[str, ...]]:
+) -> tuple[Verdict, tuple[str, ...]]:
     """The worst of all marks, and what to do; what could not be measured counts as poor.
 
     `error_px` is the median of all held-out corners in pixels of a 1920-pixel-wide image,
     `left_out` the share of views that contradict the rest.
     """
-    marks, advice = [0], []
-
-    def mark(value: float | int, good: float | int, poor: float | int, remedy: str) -> None:
-        level = 0 if value <= good else 1 if value <= poor else 2
-        marks.append(level)
-        if level:
-            advice.append(remedy)
-
-    mark(
+    marks = Marks()
+    marks.mark(
         -instants,
         -ENOUGH_INSTANTS,
         -FEW_INSTANTS,
@@ -252,14 +246,14 @@ def verdict_of(
         "more, all over the volume",
     )
     worst = max(cameras, key=lambda c: np.nan_to_num(_scaled_px(c), nan=np.inf))
-    mark(
+    marks.mark(
         left_out,
         GOOD_LEFT_OUT,
         POOR_LEFT_OUT,
         f"{100 * left_out:.0f} % of the views contradict the rest and were left out: check that "
         "cameras are in step and that the board does not bend",
     )
-    mark(
+    marks.mark(
         float(np.maximum(error_px, _scaled_px(worst) / WORST_CAMERA)),
         GOOD_PX,
         POOR_PX,
@@ -268,7 +262,7 @@ def verdict_of(
         "slowly or hold it still, check that cameras are in step and intrinsics theirs",
     )
     least = min(cameras, key=lambda c: c.coverage)
-    mark(
+    marks.mark(
         1 - least.coverage,
         1 - GOOD_COVERAGE,
         1.0,
@@ -276,7 +270,7 @@ def verdict_of(
         "through the whole volume",
     )
     off = abs(scale.mean - 1.0)
-    mark(
+    marks.mark(
         off,
         GOOD_SCALE,
         POOR_SCALE,
@@ -284,21 +278,21 @@ def verdict_of(
         "print, check the intrinsics",
     )
     spread = max(cameras, key=lambda c: np.nan_to_num(c.centre_spread_mm, nan=np.inf))
-    mark(
+    marks.mark(
         1e-3 * spread.centre_spread_mm / max(size_m, 1e-9),
         GOOD_CENTRE,
         POOR_CENTRE,
         f"'{spread.name}' moves by {spread.centre_spread_mm:.0f} mm with the choice of instants: "
         "record more boards that it shares with the others, closer to the cameras and tilted",
     )
-    mark(
+    marks.mark(
         -resamples,
         -GOOD_RESAMPLES,
         -POOR_RESAMPLES,
         f"only {resamples} of {extrinsics.RESAMPLES} resampled calibrations connect all cameras: "
         "record more boards that cameras see together",
     )
-    return ("good", "usable", "poor")[max(marks)], tuple(advice)
+    return marks.verdict, tuple(marks.advice)
 
 
 def _scaled_px(camera: CameraReport) -> float:

@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from fusecap.batch.solve import Progress, solve_session
 from fusecap.body.landmarks import LANDMARK_SETS
+from fusecap.calibrate.imus.checks import Worn
 from fusecap.calibrate.imus.identify import Identity
 from fusecap.calibrate.imus.joint_centres import MAX_INSTANTS, landmarks_seen
 from fusecap.calibrate.imus.motion import (
     SubjectCalibration,
-    Worn,
     calibrate_subject,
     identify_subject,
 )

@@ -9,8 +9,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from fusecap.calibrate.sync.clock_rows import ClockRow
 from fusecap.calibrate.sync.curves import Curve
-from fusecap.calibrate.sync.session import Row, Synchronisation
+from fusecap.calibrate.sync.session import Synchronisation
 from fusecap.files import written_whole
 
 _CLOSE_UP_S = 3.0
@@ -18,7 +19,7 @@ _CLOSE_UP_S = 3.0
 
 def draw(found: Synchronisation, path: Path | str) -> None:
     """A PNG: a row per clock with its cost over the offset, then rows of signals laid together."""
-    curves: list[tuple[Row, Curve | None]] = []
+    curves: list[tuple[ClockRow, Curve | None]] = []
     cameras = [row for row in found.rows if row.kind == "camera"]
     if found.cameras is not None:
         curves += list(zip(cameras, found.cameras.curves, strict=True))
@@ -55,7 +56,7 @@ Signals = tuple[str, str, dict[str, tuple[np.ndarray, np.ndarray]]]
 """Title, unit, and times and values by label."""
 
 
-def _signals(found: Synchronisation, sensors: Sequence[Row]) -> list[Signals]:
+def _signals(found: Synchronisation, sensors: Sequence[ClockRow]) -> list[Signals]:
     result: list[Signals] = []
     if len(found.speeds) > 1:
         traces = {name: (speed[0], speed[1]) for name, speed in found.speeds.items()}
@@ -64,14 +65,11 @@ def _signals(found: Synchronisation, sensors: Sequence[Row]) -> list[Signals]:
         if clock.aligned is not None and row.offset_s is not None:
             times_s, bones, worn = clock.aligned
             traces = {"bones in the video": (times_s, bones), "sensors": (times_s, worn)}
-            label = (
-                ", ".join(row.sensors) if len(row.sensors) < 4 else f"{len(row.sensors)} sensors"
-            )
-            result.append((f"{row.name}: {label}, mean angular speed", "rad/s", traces))
+            result.append((f"{row.name}: {_which(row)}, mean angular speed", "rad/s", traces))
     return result
 
 
-def _which(row: Row) -> str:
+def _which(row: ClockRow) -> str:
     return ", ".join(row.sensors) if len(row.sensors) < 4 else f"{len(row.sensors)} sensors"
 
 
@@ -84,9 +82,9 @@ def _liveliest_s(traces: dict[str, tuple[np.ndarray, np.ndarray]]) -> float:
     return float(times_s[int(np.argmax(mean))])
 
 
-def _panel(axes: Axes, row: Row, curve: Curve | None, about_s: float | None) -> None:
+def _panel(axes: Axes, row: ClockRow, curve: Curve | None, about_s: float | None) -> None:
     label = row.name if row.kind == "camera" else f"{row.name}: {_which(row)}"
-    title = f"{label} ({row.verdict})"
+    title = f"{label} ({row.word})"
     axes.grid(alpha=0.3)
     axes.set_ylabel("misfit")
     if curve is None:

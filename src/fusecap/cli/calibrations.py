@@ -1,0 +1,71 @@
+"""What calibration commands share: sources, reports, verdicts and the files they wrote."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from fusecap.calibrate.verdict import Verdict
+from fusecap.cli.common import console, err
+from fusecap.files import written_whole
+
+_COLOURS = {Verdict.GOOD: "green", Verdict.USABLE: "yellow", Verdict.POOR: "red"}
+
+
+def coloured(verdict: Verdict) -> str:
+    """As rich's markup."""
+    return f"[{_COLOURS[verdict]}]{verdict}[/]"
+
+
+def print_verdict(what: str, verdict: Verdict, advice: Iterable[str]) -> None:
+    """The verdict on stdout, and on stderr what to do about one that is not good."""
+    console.print(what, end=": ", markup=False)
+    console.print(coloured(verdict))
+    for remedy in advice:
+        err.print(f"{what}: {remedy}", markup=False, soft_wrap=True)
+
+
+def print_files(files: Sequence[Path | str]) -> None:
+    """Names what was written."""
+    for file in files:
+        console.print(f"wrote {file}", markup=False, soft_wrap=True)
+
+
+def named_sources(sources: list[str]) -> dict[str, str]:
+    """CAMERA=SOURCE arguments by camera; misuse exits with 2."""
+    named: dict[str, str] = {}
+    for text in sources:
+        name, equals, source = text.partition("=")
+        if not (equals and name and source):
+            raise typer.BadParameter(
+                f"'{text}': expected CAMERA=SOURCE, such as left=videos/left.mp4",
+                param_hint="SOURCES",
+            )
+        if name in named:
+            raise typer.BadParameter(f"camera '{name}' is given twice", param_hint="SOURCES")
+        named[name] = source
+    return named
+
+
+def write_report(out: Path, report: dict[str, Any]) -> Path:
+    """The report beside the calibration, as `<name>_report.json`."""
+    path = out.with_name(f"{out.stem}_report.json")
+    with written_whole(path) as file:
+        file.write(json.dumps(report, indent=2).encode())
+    return path
+
+
+def plain(value: Any) -> Any:
+    """For JSON: arrays as lists, numbers that are not finite as null."""
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())
+    return None if isinstance(value, float) and not math.isfinite(value) else value
