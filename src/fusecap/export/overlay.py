@@ -19,10 +19,10 @@ from av.container import OutputContainer
 from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 from jaxtyping import Float
-from scipy.optimize import linear_sum_assignment
 
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.files import written_whole
+from fusecap.geometry.same_people import same_people
 
 LINKS = (
     *(("nose", "neck"), ("nose", "upper_neck"), ("head_top", "neck"), ("neck", "mid_hip")),
@@ -45,7 +45,7 @@ COLOURS_BGR = (
 )
 _DRAWN_FROM = 0.1
 """Confidence below which a keypoint is not drawn."""
-_SAME_PERSON = 0.5
+_GATE = 0.5
 """Mean distance to the last picture's person, in body extents, up to which it is the same one."""
 _TICKS_HZ = 60_000
 """Time base; MPEG-4 allows up to 65535 and 29.97 Hz fits."""
@@ -55,25 +55,23 @@ class PeopleNumbers:
     """Numbers people from one picture to the next."""
 
     def __init__(self) -> None:
-        self._last: list[tuple[int, np.ndarray]] = []
+        self._numbers: list[int] = []
+        self._people: np.ndarray | None = None
         self._next = 1
 
     def update(self, people: Float[np.ndarray, "n k 3"]) -> list[int]:
         """The number of each person."""
         numbers = [0] * len(people)
-        if self._last and len(people):
-            cost = np.array(
-                [[_distance(person, last) for _, last in self._last] for person in people]
-            )
-            for row, column in zip(*linear_sum_assignment(np.minimum(cost, 1e3)), strict=True):
-                if cost[row, column] <= _SAME_PERSON:
-                    numbers[row] = self._last[column][0]
+        if self._people is not None:
+            same = same_people(self._people, people, gate_extents=_GATE)
+            for last, now in zip(*same, strict=True):
+                numbers[now] = self._numbers[last]
         for index, number in enumerate(numbers):
             if number == 0:
                 numbers[index] = self._next
                 self._next += 1
         if len(people):
-            self._last = list(zip(numbers, people, strict=True))
+            self._numbers, self._people = numbers, people
         return numbers
 
 
@@ -157,13 +155,3 @@ def _write(
 
 def _point(pixel: np.ndarray) -> tuple[int, int]:
     return int(pixel[0]), int(pixel[1])
-
-
-def _distance(person: np.ndarray, other: np.ndarray) -> float:
-    """Mean distance of shared keypoints over the larger extent of the two people."""
-    shared = (person[:, 2] > 0) & (other[:, 2] > 0)
-    if not shared.any():
-        return float("inf")
-    offset = np.linalg.norm(person[shared, :2] - other[shared, :2], axis=1).mean()
-    extents = [np.ptp(each[each[:, 2] > 0, :2], axis=0).max() for each in (person, other)]
-    return float(offset / max(*extents, 1.0))

@@ -13,10 +13,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
 from fusecap.geometry.camera import Y_UP_FROM_Z_UP
+from fusecap.geometry.same_people import same_people
 from fusecap.sources.imu_files.track import GRAVITY_M_S2, ImuTrack
 from fusecap.sources.keypoint_files import KeypointTrack
 from fusecap.types import ImuReading
@@ -27,8 +27,8 @@ MAX_GAP_S = 0.1
 """IMU samples further apart are not interpolated between; frames, where `MAX_GAP_PERIODS` of the
 camera's own are no longer."""
 MAX_GAP_PERIODS = 2.5
-GATE_HEIGHTS = 0.25
-"""Two detections further apart than this share of a person's height are two people."""
+GATE_EXTENTS = 0.25
+"""Detections of two frames further apart than this share of a person's extent are two people."""
 
 
 Frame = tuple[float, np.ndarray]
@@ -84,30 +84,11 @@ def people_amid(
 
 def _between(first: np.ndarray, second: np.ndarray, share: float) -> np.ndarray:
     """People in both frames, `share` (0-1) of the way from the first to the second."""
-    if len(first) == 0 or len(second) == 0:
-        return first[:0]
-    cost = _distance_in_heights(first, second)
-    rows, columns = linear_sum_assignment(np.minimum(cost, 10 * GATE_HEIGHTS))
-    same = cost[rows, columns] <= GATE_HEIGHTS
-    a, b = first[rows[same]], second[columns[same]]
+    rows, columns = same_people(first, second, gate_extents=GATE_EXTENTS)
+    a, b = first[rows], second[columns]
     mixed = a + share * (b - a)
     mixed[np.isnan(mixed[:, :, 0]), 2] = 0.0
     return mixed[(mixed[:, :, 2] > 0).any(axis=1)]
-
-
-def _distance_in_heights(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """(n, m): mean distance of the shared keypoints over the larger extent of the two people."""
-    offset = np.linalg.norm(first[:, None, :, :2] - second[None, :, :, :2], axis=3)
-    shared = np.isfinite(offset)
-    distance = np.where(shared, offset, 0.0).sum(2) / np.maximum(shared.sum(2), 1)
-    extent = np.maximum(_extent(first)[:, None], _extent(second)[None, :])
-    return np.where(shared.any(axis=2), distance / np.maximum(extent, 1.0), np.inf)
-
-
-def _extent(people: np.ndarray) -> np.ndarray:
-    xy = people[:, :, :2]
-    span = np.fmax.reduce(xy, axis=1) - np.fmin.reduce(xy, axis=1)
-    return span.max(axis=1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

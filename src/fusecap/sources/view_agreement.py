@@ -16,6 +16,7 @@ from scipy.optimize import linear_sum_assignment
 
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.geometry.camera import Camera, Rig
+from fusecap.geometry.epipolar import essential_matrix
 from fusecap.sources.keypoint_files import KeypointTrack
 from fusecap.sources.synchronizer import people_at
 
@@ -50,9 +51,9 @@ def pair_distances_px(
     if len(people_a) == 0 or len(people_b) == 0:
         return none, none, np.empty(0)
     a, b = _rays(first, people_a), _rays(second, people_b)
-    b_from_a = second.rotation @ first.rotation.T
-    x, y, z = second.translation - b_from_a @ first.translation
-    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ b_from_a
+    essential = essential_matrix(
+        (first.rotation, second.rotation), (first.position_in_world, second.position_in_world)
+    )
     lines_in_b, lines_in_a = a @ essential.T, b @ essential
     with np.errstate(divide="ignore", invalid="ignore"):
         product = np.abs(np.einsum("nki,mki->nmk", lines_in_b, b))

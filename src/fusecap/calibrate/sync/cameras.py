@@ -41,6 +41,7 @@ from fusecap.calibrate.sync.curves import (
 )
 from fusecap.calibrate.sync.signals import View
 from fusecap.geometry.camera import Rig
+from fusecap.geometry.epipolar import essential_matrix
 
 Progress = Callable[[str, int, int], None]
 Pair = tuple[int, int]
@@ -279,7 +280,7 @@ def _standardised(signal: Float[np.ndarray, "t g"]) -> Float[np.ndarray, "t g"]:
 def _essential(
     rig: Rig, pair: Pair, poses: Float[np.ndarray, "c 6"] | None = None
 ) -> Float[np.ndarray, "3 3"]:
-    """Of calibrated coordinates: y' E x = 0. `poses` turn [rad] and move [m] the cameras."""
+    """`poses` turn [rad] and move [m] the cameras."""
     turned, placed = [], []
     for camera in pair:
         known = rig.cameras[camera]
@@ -287,10 +288,7 @@ def _essential(
         rotation = Rotation.from_rotvec(turn).as_matrix() @ known.rotation
         turned.append(rotation)
         placed.append(known.position_in_world + move)
-    b_from_a = turned[1] @ turned[0].T
-    x, y, z = turned[1] @ (placed[0] - placed[1])
-    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ b_from_a
-    return essential / max(float(np.linalg.norm([x, y, z])), 1e-9)
+    return essential_matrix((turned[0], turned[1]), (placed[0], placed[1]))
 
 
 def _direction(velocity: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
 from fusecap.geometry.camera import Camera
+from fusecap.geometry.same_people import same_people
 from fusecap.sources.keypoint_files import KeypointTrack
-from fusecap.sources.synchronizer import MAX_GAP_PERIODS
+from fusecap.sources.synchronizer import GATE_EXTENTS, MAX_GAP_PERIODS
 
 SMOOTH_S = 0.035
 """Standard deviation of the kernel: at 3 Hz it leaves 80 % of a signal."""
@@ -33,9 +33,6 @@ frame periods are longer."""
 MIN_CONFIDENCE = 0.3
 
 _REACH = 2.5
-_LINK_EXTENTS = 0.25
-"""Two detections of consecutive frames further apart than this share of a person's extent are two
-people."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,8 +174,9 @@ def _linked(
     max_gap_s = _max_gap_s(times_s)
     for frame, now in enumerate(people):
         current: list[tuple[int, int] | None] = [None] * len(now)
-        if frame and last and len(now) and times_s[frame] - times_s[frame - 1] <= max_gap_s:
-            for before, after in _same_people(people[frame - 1], now):
+        if frame and times_s[frame] - times_s[frame - 1] <= max_gap_s:
+            same = same_people(people[frame - 1], now, gate_extents=GATE_EXTENTS)
+            for before, after in zip(*same, strict=True):
                 current[after] = last[before]
         taken = {each[1] for each in current if each}
         for index, each in enumerate(current):
@@ -191,25 +189,6 @@ def _linked(
         tracklets += [tracklet for tracklet, _ in last]
         slots += [slot for _, slot in last]
     return np.array(tracklets, dtype=np.int64), np.array(slots, dtype=np.int64)
-
-
-def _same_people(first: np.ndarray, second: np.ndarray) -> list[tuple[int, int]]:
-    away = np.linalg.norm(first[:, None, :, :2] - second[None, :, :, :2], axis=3)
-    shared = np.isfinite(away)
-    distance = np.where(shared, away, 0.0).sum(2) / np.maximum(shared.sum(2), 1)
-    extent = np.maximum(_extent(first)[:, None], _extent(second)[None, :])
-    cost = np.where(shared.any(2), distance / np.maximum(extent, 1.0), 9.0)
-    rows, columns = (
-        (np.zeros(1, int), np.zeros(1, int)) if cost.size == 1 else linear_sum_assignment(cost)
-    )
-    return [
-        (int(r), int(c)) for r, c in zip(rows, columns, strict=True) if cost[r, c] <= _LINK_EXTENTS
-    ]
-
-
-def _extent(people: np.ndarray) -> np.ndarray:
-    xy = people[:, :, :2]
-    return (np.fmax.reduce(xy, axis=1) - np.fmin.reduce(xy, axis=1)).max(axis=1)
 
 
 def smoothed(
