@@ -11,7 +11,7 @@ import pytest
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 
 
-@pytest.mark.parametrize("name", ["solver_as_a_library.py"])
+@pytest.mark.parametrize("name", ["own_detections.py", "solver_as_a_library.py"])
 def test_example_runs_and_says_what_it_did(name):
     result = subprocess.run(
         [sys.executable, EXAMPLES / name], capture_output=True, text=True, check=False

@@ -1,101 +1,79 @@
-"""fusecap: full 6-DoF motion of several people from a few cameras and body-worn IMUs.
+"""fusecap: full 6-DoF motion of several people from a few cameras and body-worn IMUs, live.
 
-The names below load on first use, so that `import fusecap` stays quick.
+The names below are all that is public here. They load on first use, so that `import fusecap` stays
+quick.
 """
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from fusecap.batch.solve import Solved, SolveReport, solve_session
-    from fusecap.body.landmarks import LandmarkSet, landmark_set_named
-    from fusecap.body.prior import PosePrior, load_prior
-    from fusecap.body.shape import BodyShape
-    from fusecap.body.skeleton import EXTENDED23, PAPER21, Skeleton
-    from fusecap.errors import FusecapError
-    from fusecap.geometry.camera import Camera, Rig
-    from fusecap.solve.estimator import Estimator, SubjectModel
-    from fusecap.solve.options import SolverOptions, Weights
-    from fusecap.solve.pose_solver import ImuSites
-    from fusecap.sources.session import Session, load_session
-    from fusecap.sources.session_data import open_session
-    from fusecap.take import Take, load_take, save_take
-    from fusecap.types import Detections, Estimate, ImuReading, Observation, Status
+    from fusecap.associate.tracker import Tracker as Tracker
+    from fusecap.associate.tracker import TrackerOptions as TrackerOptions
+    from fusecap.batch.solve import Solved as Solved
+    from fusecap.batch.solve import SolveReport as SolveReport
+    from fusecap.batch.solve import solve_session as solve_session
+    from fusecap.body.landmarks import LandmarkSet as LandmarkSet
+    from fusecap.body.landmarks import landmark_set_named as landmark_set_named
+    from fusecap.body.prior import PosePrior as PosePrior
+    from fusecap.body.prior import load_prior as load_prior
+    from fusecap.body.shape import BodyShape as BodyShape
+    from fusecap.body.skeleton import EXTENDED23 as EXTENDED23
+    from fusecap.body.skeleton import PAPER21 as PAPER21
+    from fusecap.body.skeleton import Skeleton as Skeleton
+    from fusecap.errors import FusecapError as FusecapError
+    from fusecap.geometry.camera import Camera as Camera
+    from fusecap.geometry.camera import Rig as Rig
+    from fusecap.pipeline import Pipeline as Pipeline
+    from fusecap.pipeline import Step as Step
+    from fusecap.setup import Setup as Setup
+    from fusecap.setup import setup_of as setup_of
+    from fusecap.solve.estimator import Estimator as Estimator
+    from fusecap.solve.estimator import SubjectModel as SubjectModel
+    from fusecap.solve.options import SolverOptions as SolverOptions
+    from fusecap.solve.options import Weights as Weights
+    from fusecap.solve.pose_solver import ImuSites as ImuSites
+    from fusecap.sources.session import Session as Session
+    from fusecap.sources.session import load_session as load_session
+    from fusecap.sources.session_data import open_session as open_session
+    from fusecap.take import Take as Take
+    from fusecap.take import load_take as load_take
+    from fusecap.take import save_take as save_take
+    from fusecap.types import Detections as Detections
+    from fusecap.types import Estimate as Estimate
+    from fusecap.types import ImuReading as ImuReading
+    from fusecap.types import Observation as Observation
+    from fusecap.types import Status as Status
 
-_HOME = {
-    "LandmarkSet": "body.landmarks",
-    "landmark_set_named": "body.landmarks",
-    "PosePrior": "body.prior",
-    "load_prior": "body.prior",
-    "BodyShape": "body.shape",
-    "EXTENDED23": "body.skeleton",
-    "PAPER21": "body.skeleton",
-    "Skeleton": "body.skeleton",
-    "FusecapError": "errors",
-    "Camera": "geometry.camera",
-    "Rig": "geometry.camera",
-    "Solved": "batch.solve",
-    "SolveReport": "batch.solve",
-    "solve_session": "batch.solve",
-    "Take": "take",
-    "load_take": "take",
-    "save_take": "take",
-    "Estimator": "solve.estimator",
-    "SubjectModel": "solve.estimator",
-    "SolverOptions": "solve.options",
-    "Weights": "solve.options",
-    "ImuSites": "solve.pose_solver",
-    "Session": "sources.session",
-    "load_session": "sources.session",
-    "open_session": "sources.session_data",
-    "Detections": "types",
-    "Estimate": "types",
-    "ImuReading": "types",
-    "Observation": "types",
-    "Status": "types",
-}
+    __version__: str
+else:
+    # Type checkers read the imports above; here they are read as text, when a name is first used.
+    def __getattr__(name):
+        import importlib
+        import importlib.metadata
 
-__all__ = [  # noqa: RUF022  (grouped by module, as above)
-    "LandmarkSet",
-    "landmark_set_named",
-    "PosePrior",
-    "load_prior",
-    "BodyShape",
-    "EXTENDED23",
-    "PAPER21",
-    "Skeleton",
-    "FusecapError",
-    "Camera",
-    "Rig",
-    "Solved",
-    "SolveReport",
-    "solve_session",
-    "Take",
-    "load_take",
-    "save_take",
-    "Estimator",
-    "SubjectModel",
-    "SolverOptions",
-    "Weights",
-    "ImuSites",
-    "Session",
-    "load_session",
-    "open_session",
-    "Detections",
-    "Estimate",
-    "ImuReading",
-    "Observation",
-    "Status",
-]
+        if name == "__version__":
+            return importlib.metadata.version("fusecap")
+        homes = _homes()
+        if name == "__all__":
+            return list(homes)
+        if name not in homes:
+            raise AttributeError(f"module 'fusecap' has no attribute '{name}'")
+        globals()[name] = found = getattr(importlib.import_module(homes[name]), name)
+        return found
 
+    def __dir__():
+        return sorted({*globals(), *_homes()})
 
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module 'fusecap' has no attribute '{name}'")
-    return getattr(importlib.import_module(f"fusecap.{_HOME[name]}"), name)
+    def _homes():
+        """The module that each public name lives in."""
+        import ast
 
-
-def __dir__() -> list[str]:
-    return sorted(_HOME)
+        return {
+            alias.asname: item.module
+            for item in ast.walk(ast.parse(__loader__.get_source(__name__)))
+            if isinstance(item, ast.ImportFrom)
+            for alias in item.names
+            if alias.asname
+        }
