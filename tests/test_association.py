@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from fusecap.associate.anatomy import Anatomy
-from fusecap.associate.assignment import assign_each_view
 from fusecap.associate.candidates import CandidateOptions, find_candidates, triangulate_pairs
+from fusecap.associate.matching import assign_each_view
+from fusecap.associate.options import TrackerOptions
 from fusecap.associate.paper import PaperSorter
 from fusecap.associate.subjects import Subject
-from fusecap.associate.tracker import Tracker, TrackerOptions
+from fusecap.associate.tracker import Tracker
 from fusecap.associate.views import Views
 from fusecap.errors import SessionError
 from fusecap.types import Detections, TrackState

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from fusecap.associate.options import TrackerOptions
 from fusecap.associate.subjects import Subject
-from fusecap.associate.tracker import Tracker, TrackerOptions
+from fusecap.associate.tracker import Tracker
 from fusecap.errors import SessionError
 from fusecap.types import Detections, TrackState
 from people_scene import BODY25, RATE_HZ, observe, ring_of_cameras, straight, walker

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from fusecap.associate.tracker import TrackerOptions
+from fusecap.associate.options import TrackerOptions
 from fusecap.batch.solve import SessionInstants, solve_instants
 from fusecap.errors import SessionError
 from fusecap.evaluate.demo_scene import demo_scene

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fusecap.associate.tracker import TrackerOptions
+from fusecap.associate.options import TrackerOptions
 from fusecap.body.landmarks import LANDMARK_SETS, LandmarkSet
 from fusecap.body.prior import PosePrior, load_prior
 from fusecap.body.shape import REFERENCE_HEIGHT_M, BodyShape

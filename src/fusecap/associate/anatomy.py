@@ -89,3 +89,10 @@ class Anatomy:
         if len(torso) == 0:
             torso = landmarks[np.isfinite(landmarks[:, 0])]
         return torso.sum(axis=0) / len(torso) if len(torso) else np.full(3, np.nan)
+
+
+def size_misfit(a: np.ndarray, b: np.ndarray) -> float:
+    """Mean relative difference of two bodies' limb lengths; 0 where too few are known."""
+    relative = np.abs(a - b) / (0.5 * (a + b))
+    relative = relative[np.isfinite(relative)]
+    return float(relative.mean()) if len(relative) >= MIN_LIMBS else 0.0

@@ -1,11 +1,23 @@
-"""Who is to be tracked."""
+"""Who is to be tracked: the subjects' places, and the memory of who left one.
+
+A place waits for its first track, is live while that track is followed, and is missing once it is
+lost; a newcomer may be who is missing, and then continues under that name and track id.
+"""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
+from fusecap.associate.anatomy import Anatomy, size_misfit
+from fusecap.associate.matching import cheapest
+from fusecap.associate.options import TrackerOptions
+from fusecap.associate.track import Track
 from fusecap.errors import SessionError
+from fusecap.geometry.camera import Rig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,3 +35,188 @@ def check_distinct(subjects: Sequence[Subject]) -> None:
     doubled = sorted({name for name in names if names.count(name) > 1})
     if doubled:
         raise SessionError(f"two subjects are called {', '.join(doubled)}; names must differ")
+
+
+@dataclass(slots=True, kw_only=True)
+class Place:
+    """A subject's place in the session: waiting (no track yet), live, or missing."""
+
+    name: str
+    named: bool
+    start_m: tuple[float, float] | None
+    track: Track | None = None
+    live: bool = False
+
+
+class Cast:
+    """All places of a session, and who may take one."""
+
+    def __init__(
+        self, subjects: Sequence[Subject], rig: Rig, anatomy: Anatomy, options: TrackerOptions
+    ) -> None:
+        check_distinct(subjects)
+        self._rig = rig
+        self._anatomy = anatomy
+        self._options = options
+        self._places = [Place(name=s.name, named=True, start_m=s.start_m) for s in subjects]
+        self._single = len(rig) == 1
+        self.size = options.max_subjects or len(subjects) or sys.maxsize
+        """Subjects there may be at most."""
+        if self.size < len(subjects):
+            raise SessionError(
+                f"max_subjects is {self.size}, but {len(subjects)} subjects are named"
+            )
+        if self._single:
+            if 1 < self.size < sys.maxsize:
+                raise SessionError(
+                    f"one camera cannot tell {self.size} people apart; "
+                    "set max_subjects = 1 or add a camera"
+                )
+            self.size = 1
+
+    @property
+    def is_full(self) -> bool:
+        """Every place is taken by somebody who is being followed."""
+        return sum(place.live for place in self._places) >= self.size
+
+    @property
+    def start_m(self) -> tuple[float, float] | None:
+        """Where the first subject begins, if it is known."""
+        return self._places[0].start_m if self._places else None
+
+    def followed(self) -> list[tuple[str, Track]]:
+        """Names and tracks of the live places, in their order."""
+        return [(p.name, p.track) for p in self._places if p.live and p.track is not None]
+
+    def ids(self) -> set[int]:
+        """Track ids of the live places."""
+        return {track.track_id for _, track in self.followed()}
+
+    def reinitialise(self, name: str) -> list[Track | None]:
+        """Empty the place of that name, start position included, or all; whoever had them."""
+        places = [place for place in self._places if name in ("", place.name)]
+        gone = [place.track for place in places]
+        for place in places:
+            place.track, place.live = None, False
+            if name:
+                place.start_m = None
+        return gone
+
+    def add(self, name: str) -> None:
+        """Make room for one more; raises `SessionError` for a second before a single camera."""
+        if self._single and self.size > 0:
+            raise SessionError("one camera cannot tell two people apart; add a camera")
+        if name and all(place.name != name for place in self._places):
+            self._places.append(Place(name=name, named=True, start_m=None))
+        if self.size < sys.maxsize:
+            self.size += 1
+
+    def remove(self, name: str) -> None:
+        """Take a place away; whoever was followed there becomes no subject by itself."""
+        for place in [place for place in self._places if place.name == name]:
+            self._places.remove(place)
+            if place.live and place.track is not None:
+                place.track.dismissed = True
+            if self.size < sys.maxsize:
+                self.size -= 1
+
+    def forget(self, tracks: Sequence[Track], now_ns: int) -> None:
+        """Places of tracks that are no more are missing, and after a while nobody's."""
+        o = self._options
+        for place in self._places:
+            place.live = place.live and place.track in tracks
+        self._places = [
+            place
+            for place in self._places
+            if place.live
+            or place.named
+            or (place.track and (now_ns - place.track.seen_ns) * 1e-9 <= o.memory_s)
+        ]
+
+    def admit(self, tracks: Sequence[Track], now_ns: int) -> None:
+        """Give established newcomers inside the volume a subject's place while there is one."""
+        subjects = self.ids()
+        newcomers = [
+            track
+            for track in tracks
+            if track.track_id not in subjects
+            and not track.dismissed
+            and track.seen_ns == now_ns
+            and track.is_established(self._options)
+            and self.inside(track)
+        ]
+        if not newcomers:
+            return
+        known = [p for p in self._places if not p.live and (p.track or p.start_m)]
+        cost = np.array([[self._claim(t, p) for p in known] for t in newcomers])
+        admitted = cheapest(cost.reshape(len(newcomers), len(known)))
+        for n, p in admitted:
+            self._admit_to(known[p], newcomers[n])
+        rest = [t for n, t in enumerate(newcomers) if n not in dict(admitted)]
+        rest.sort(key=lambda t: (-t.frames, self._from_middle(t)))
+        waiting = [p for p in self._places if not (p.live or p.track or p.start_m)]
+        chosen = rest[: len(waiting) + max(self._room(), 0)]
+        for track in sorted(chosen, key=lambda t: t.track_id):
+            if not waiting:
+                waiting.append(Place(name=self._free_name(), named=False, start_m=None))
+                self._places.append(waiting[0])
+            self._admit_to(waiting.pop(0), track)
+
+    def _claim(self, track: Track, place: Place) -> float:
+        """How badly a newcomer fits a waiting or missing subject [m]; infinite: not at all."""
+        o = self._options
+        centre = self._anatomy.centre(track.landmarks)
+        if place.track is None:
+            assert place.start_m is not None
+            away = float(np.hypot(centre[0] - place.start_m[0], centre[2] - place.start_m[1]))
+            if self._single:
+                return 0.0  # One camera gives no place to compare with.
+            return away if away < o.start_radius_m else np.inf
+        lost = place.track
+        if track.born_ns <= lost.seen_ns:
+            return np.inf  # Both were seen at once: two people.
+        away = np.nan_to_num(np.linalg.norm(centre - self._anatomy.centre(lost.landmarks)))
+        misfit = size_misfit(lost.limb_lengths_m(), track.limb_lengths_m())
+        reach = o.reach_m + 2 * o.reach_speed_m_s * (track.born_ns - lost.seen_ns) * 1e-9
+        optional = self._room() > 0 or any(p.track is None for p in self._places)
+        if optional and (misfit > o.size_tolerance or away > reach):
+            return np.inf
+        return float(away / reach + misfit / o.size_tolerance)
+
+    @staticmethod
+    def _admit_to(place: Place, track: Track) -> None:
+        if place.track is not None:
+            track.track_id = place.track.track_id
+            track.limb_sum_m += place.track.limb_sum_m
+            track.limb_count += place.track.limb_count
+        place.track = track
+        place.live = True
+
+    def inside(self, track: Track) -> bool:
+        """Whether the torso is over the capture volume; an unknown place is."""
+        if self._options.volume_m is None:
+            return True
+        x_min, x_max, z_min, z_max = self._options.volume_m
+        x, _, z = self._anatomy.centre(track.landmarks)
+        return not (x < x_min or x > x_max or z < z_min or z > z_max)
+
+    def _from_middle(self, track: Track) -> float:
+        """Distance on the floor [m] to the middle of the volume, or of where the cameras look."""
+        centre = self._anatomy.centre(track.landmarks)[[0, 2]]
+        if self._options.volume_m is None:
+            middle = np.mean([c.position_in_world[[0, 2]] for c in self._rig.cameras], axis=0)
+        else:
+            x_min, x_max, z_min, z_max = self._options.volume_m
+            middle = np.array([x_min + x_max, z_min + z_max]) / 2
+        return float(np.linalg.norm(centre - middle))
+
+    def _room(self) -> int:
+        """How many more subjects there may be."""
+        return self.size - len(self._places)
+
+    def _free_name(self) -> str:
+        taken = {place.name for place in self._places}
+        number = 1
+        while f"person{number}" in taken:
+            number += 1
+        return f"person{number}"

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from fusecap.associate.options import TrackerOptions
 from fusecap.kernels import association as kernels
 
 POSITION_GAIN = 0.8
@@ -92,6 +93,13 @@ class Track:
             self.alone_ns = 0
         elif looking > 1:
             self.alone_ns += elapsed_ns
+
+    def is_established(self, options: TrackerOptions) -> bool:
+        """Whether enough views saw it for long enough to be a person."""
+        lasted_s = (self.triangulated_ns - self.born_ns) * 1e-9
+        return self.strong_frames >= options.birth_frames or (
+            self.frames >= options.birth_frames and lasted_s >= options.two_view_birth_s
+        )
 
     def limb_lengths_m(self) -> np.ndarray:
         """Mean limb lengths [m] (m,); NaN where never seen."""

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from fusecap.associate.tracker import TrackerOptions
+from fusecap.associate.options import TrackerOptions
 from fusecap.batch.solve import Progress, Solved, solve_instants
 from fusecap.body.prior import PosePrior, load_prior
 from fusecap.evaluate.simulator import Simulation

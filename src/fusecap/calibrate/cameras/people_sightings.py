@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from fusecap.associate.candidates import CandidateOptions
-from fusecap.associate.tracker import TrackerOptions
+from fusecap.associate.options import TrackerOptions
 from fusecap.batch.solve import Progress
 from fusecap.geometry.camera import Rig
 from fusecap.pipeline import Pipeline, observation_of

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from fusecap.associate.tracker import TrackerOptions
+from fusecap.associate.options import TrackerOptions
 from fusecap.batch.solve import Progress, Solved, solve_instants
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.body.pose import landmarks_in_world
