@@ -28,7 +28,7 @@ def test_people_times_and_progress_come_back(tmp_path):
     assert np.allclose(track.times_s, [7 / 25 + 0.5, 8 / 25 + 0.5, 9 / 25 + 0.5])
     assert [len(people) for people in track.people] == [1, 0, 2]
     assert np.array_equal(track.people[2][1], person(300))
-    assert seen == [(1, 3), (2, 3), (3, 3)]
+    assert seen == [("camera 'cam'", done, 3) for done in (1, 2, 3)]
 
 
 def test_missing_keypoints_become_nan_with_confidence_0(tmp_path):

@@ -52,7 +52,7 @@ def test_training_twice_gives_the_same_prior(motion_folder):
 @pytest.mark.slow
 def test_progress_reaches_the_end(motion_folder):
     seen = []
-    train_prior(motion_folder, PAPER21, progress=lambda done, total, _: seen.append((done, total)))
+    train_prior(motion_folder, PAPER21, progress=lambda _, done, total: seen.append((done, total)))
     assert [done for done, _ in seen] == sorted(done for done, _ in seen)
     assert seen[-1][0] == seen[-1][1]
 

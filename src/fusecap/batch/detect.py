@@ -20,10 +20,9 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -36,6 +35,7 @@ from fusecap.errors import InputError, SessionError
 from fusecap.export import openpose
 from fusecap.files import safe_name
 from fusecap.pipeline import Pipeline
+from fusecap.progress import Progress
 from fusecap.setup import Setup, setup_of
 from fusecap.sources.detection_files import DetectionRecord, mark, read_record
 from fusecap.sources.frame_sets import FramePlan, clock_times_ns, every_frame, frame_sets
@@ -44,9 +44,6 @@ from fusecap.sources.session import Session
 from fusecap.sources.session_data import open_rig
 from fusecap.sources.video import Video
 from fusecap.types import Detections
-
-Progress = Callable[[str, int, int], None]
-"""Called with (what is being done, done, total)."""
 
 SIZE_TOLERANCE = 0.02
 """Relative difference up to which a video may have another size than its calibration: encoders drop
@@ -350,13 +347,10 @@ class _Work:
         """Frames, those written included."""
         self._landmark_count = len(detector.landmarks.landmark_names)
         self._undecodable = 0
-        report = None
-        if progress is not None:
-            report = partial(progress, f"reading {camera.video.path.name} MB")
         self._record = DetectionRecord(
             landmark_set=detector.landmarks.name,
             detector=detector.identity,
-            video=mark(camera.video, report),
+            video=mark(camera.video, progress),
             times_ns=camera.video.times_ns,
             complete=False,
         )

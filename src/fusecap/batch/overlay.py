@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from fusecap.batch.detect import CameraVideo, Progress
+from fusecap.batch.detect import CameraVideo
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.export.openpose import frame_path
 from fusecap.export.overlay import PeopleNumbers, draw_people, overlay_writer
+from fusecap.progress import Progress
 from fusecap.sources.keypoint_files import read_people
 
 

@@ -13,10 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from fusecap.batch.solve import Progress, Solved, SolveReport, describe_subjects
+from fusecap.batch.solve import Solved, SolveReport, describe_subjects
 from fusecap.body.shape import REFERENCE_HEIGHT_M, BodyShape
 from fusecap.engine.engine import Engine, LiveStep
 from fusecap.errors import InputError
+from fusecap.progress import Progress
 from fusecap.recording.reader import SUFFIX, RecordedBody, RecordedEvent, RecordedPose, Recording
 from fusecap.recording.setup_json import setup_from_values
 from fusecap.setup import SessionSetup
@@ -46,8 +47,7 @@ class Replay:
     def steps(self, progress: Progress | None = None) -> Iterator[LiveStep]:
         """Every solved instant; once."""
         number, people = 0, {}
-        report = progress and (lambda done, total: progress("replaying", done, total))
-        for item in self._recording.items(report):
+        for item in self._recording.items(progress):
             if isinstance(item, RecordedEvent):
                 step = None
                 try:
@@ -126,8 +126,7 @@ def recorded_take(recording: Recording, progress: Progress | None = None) -> Tak
     times_ns: list[int] = []
     rows: dict[str, list[tuple[int, RecordedPose]]] = {s.name: [] for s in session.subjects}
     shapes: dict[str, BodyShape] = {}
-    report = progress and (lambda done, total: progress("reading", done, total))
-    for item in recording.items(report):
+    for item in recording.items(progress):
         if isinstance(item, RecordedBody):
             shapes[item.name] = item.shape
         elif isinstance(item, RecordedPose):

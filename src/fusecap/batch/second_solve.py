@@ -15,10 +15,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fusecap.batch.replay import Replay, loss_notes, recorded_setup
-from fusecap.batch.solve import Progress, Solved, solve_instants
+from fusecap.batch.solve import Solved, solve_instants
 from fusecap.engine.cameras import Cameras
 from fusecap.engine.sensors import Sensors
 from fusecap.errors import InputError
+from fusecap.progress import Progress
 from fusecap.recording.reader import RecordedEvent, Recording
 from fusecap.setup import setup_of
 from fusecap.sources.session import Session, SubjectSettings
@@ -76,8 +77,7 @@ def solve_recording(recording: Recording, progress: Progress | None = None) -> S
     samples: list[Sample] = []
     ticks_ns: list[int] = []
     commands: list[Command] = []
-    report = progress and (lambda done, total: progress("reading", done, total))
-    for item in recording.items(report):
+    for item in recording.items(progress):
         match item:
             case RecordedEvent(event=Tick() as tick):
                 ticks_ns.append(tick.timestamp_ns)

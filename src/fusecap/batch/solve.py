@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -20,14 +20,12 @@ import numpy as np
 
 from fusecap.body.shape import BodyShape
 from fusecap.pipeline import Pipeline, observation_of
+from fusecap.progress import Progress
 from fusecap.setup import Setup, setup_of
 from fusecap.solve.reprojection import Reprojection
 from fusecap.sources.session_data import SessionData
 from fusecap.take import Take, TakeBuilder, provenance
 from fusecap.types import Detections, Estimate, ImuReading, TrackState, TrackUpdate
-
-Progress = Callable[[str, int, int], None]
-"""Called with (what is being done, instants done, instants in all)."""
 
 
 @runtime_checkable

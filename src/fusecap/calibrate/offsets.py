@@ -45,7 +45,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.optimize import linear_sum_assignment
 
-from fusecap.batch.solve import Progress, SessionInstants, solve_instants
+from fusecap.batch.solve import SessionInstants, solve_instants
 from fusecap.body.landmarks import LANDMARKS, LandmarkOffsets, LandmarkSet
 from fusecap.body.pose import landmarks_in_world
 from fusecap.calibrate.verdict import Verdict
@@ -53,6 +53,7 @@ from fusecap.errors import InputError
 from fusecap.evaluate.metrics import Summary, summarize
 from fusecap.geometry.camera import Rig
 from fusecap.geometry.triangulation import triangulate
+from fusecap.progress import Progress
 from fusecap.setup import setup_of
 from fusecap.sources.session_data import SessionData
 from fusecap.take import Take

@@ -28,7 +28,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from fusecap.batch.solve import Instants, Progress, solve_instants
+from fusecap.batch.solve import Instants, solve_instants
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.body.shape import MAX_HEIGHT_M, MIN_HEIGHT_M, BodyShape
 from fusecap.body.skeleton import Skeleton
@@ -41,6 +41,7 @@ from fusecap.calibrate.offsets import (
 )
 from fusecap.errors import InputError, nearest
 from fusecap.evaluate.metrics import Summary
+from fusecap.progress import Progress
 from fusecap.setup import Setup
 from fusecap.solve.estimator import SubjectModel
 from fusecap.sources.toml_text import quoted

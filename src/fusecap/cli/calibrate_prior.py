@@ -34,7 +34,7 @@ def prior(
             motion,
             body,
             seed=seed,
-            progress=lambda done, total, text: show(text, done, total),
+            progress=show,
         )
     save_prior(trained, out)
     if as_json:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,6 +15,7 @@ from fusecap.errors import nearest
 
 if TYPE_CHECKING:
     from fusecap.batch.solve import Solved
+    from fusecap.progress import Progress
     from fusecap.take import Take
 
 err = Console(stderr=True, highlight=False, emoji=False)
@@ -35,7 +36,7 @@ def check_choice(option: str, value: str, known: tuple[str, ...]) -> None:
 
 
 @contextmanager
-def progress(*, quiet: bool, rate: bool = False) -> Iterator[Callable[[str, int, int], None]]:
+def progress(*, quiet: bool, rate: bool = False) -> Iterator[Progress]:
     """A bar with ETA on stderr, one per kind of work; silent with --json.
 
     With `rate` it also shows how many are done per second.
@@ -43,13 +44,13 @@ def progress(*, quiet: bool, rate: bool = False) -> Iterator[Callable[[str, int,
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
-        Progress,
         ProgressColumn,
         Task,
         TextColumn,
         TimeElapsedColumn,
         TimeRemainingColumn,
     )
+    from rich.progress import Progress as Bars
 
     class Rate(ProgressColumn):
         def render(self, task: Task) -> str:
@@ -64,7 +65,7 @@ def progress(*, quiet: bool, rate: bool = False) -> Iterator[Callable[[str, int,
         TextColumn("ETA"),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=err, disable=quiet, transient=True) as bars:
+    with Bars(*columns, console=err, disable=quiet, transient=True) as bars:
         tasks: dict[str, Any] = {}
 
         def show(what: str, done: int, total: int) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.detect.detector import Detector, DetectorOptions
 from fusecap.detect.model_store import model_path
@@ -15,9 +13,7 @@ from fusecap.detect.runtimes.choice import open_network
 from fusecap.detect.runtimes.network import Network
 from fusecap.detect.top_down import TopDownDetector
 from fusecap.errors import InputError
-
-Progress = Callable[[str, int, int], None]
-"""Called with (what, bytes done, bytes in all) during downloads."""
+from fusecap.progress import Progress
 
 
 def build_detector(

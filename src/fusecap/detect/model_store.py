@@ -19,16 +19,14 @@ import shutil
 import urllib.error
 import urllib.request
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from http.client import HTTPException
 from pathlib import Path
 from typing import BinaryIO
 
 from fusecap.errors import InputError, nearest
-
-Progress = Callable[[str, int, int], None]
-"""Called with (what, bytes done, bytes in all)."""
+from fusecap.progress import Progress
 
 TIMEOUT_S = 10.0
 """For each address of the server until it answers, and later without a byte from it."""

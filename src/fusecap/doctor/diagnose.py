@@ -15,6 +15,7 @@ from fusecap.doctor.views import check_views
 from fusecap.errors import FusecapError
 from fusecap.findings import Finding, Findings, Severity
 from fusecap.geometry.camera import Rig
+from fusecap.progress import Progress
 from fusecap.sources.keypoint_files import KeypointTrack
 from fusecap.sources.session import (
     FILE_NAME,
@@ -25,7 +26,6 @@ from fusecap.sources.session import (
     with_imu_calibration,
 )
 from fusecap.sources.session_data import (
-    Progress,
     open_rig,
     session_clocks,
     solve_times_s,

@@ -8,9 +8,10 @@ from fusecap.body.landmarks import LANDMARK_SETS, LandmarkSet
 from fusecap.errors import FusecapError
 from fusecap.findings import Findings
 from fusecap.geometry.camera import Camera, Rig
+from fusecap.progress import Progress
 from fusecap.sources.keypoint_files import KeypointTrack, read_keypoints
 from fusecap.sources.session import Session
-from fusecap.sources.session_data import Progress, broken_files, common_landmarks
+from fusecap.sources.session_data import broken_files, common_landmarks
 
 LOW_COVERAGE = 0.1
 
@@ -25,10 +26,8 @@ def check_keypoints(
     except FusecapError as error:
         findings.add("error", "cameras", str(error).split(": ", 1)[-1])
         return tracks
-    for done, camera in enumerate(session.cameras, start=1):
+    for camera in session.cameras:
         where = f"camera '{camera.name}'"
-        if progress is not None:
-            progress(where, done, len(session.cameras))
         if camera.keypoints is None or landmarks is None or not camera.keypoints.is_dir():
             continue
         try:
@@ -39,6 +38,7 @@ def check_keypoints(
                 rate_hz=session.camera_rate_hz(camera),
                 offset_s=camera.offset_s,
                 own_times=camera.rate_hz is None,
+                progress=progress,
             )
         except FusecapError as error:
             findings.add("error", where, str(error))

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from fusecap.batch.replay import recorded_setup
-from fusecap.batch.solve import Progress
 from fusecap.findings import Finding, Findings, Severity
+from fusecap.progress import Progress
 from fusecap.recording.reader import RecordedEvent, RecordedPose, Recording
 from fusecap.types import CameraSample, ImuSample, Tick
 
@@ -29,8 +29,7 @@ def diagnose_recording(path: Path | str, progress: Progress | None = None) -> li
     ticks_ns: list[int] = []
     poses: dict[str, int] = {}
     commands = 0
-    report = progress and (lambda done, total: progress("reading", done, total))
-    for item in recording.items(report):
+    for item in recording.items(progress):
         match item:
             case RecordedEvent(event=CameraSample() as sample):
                 cameras[setup.rig.names[sample.camera]].append(sample.timestamp_ns)

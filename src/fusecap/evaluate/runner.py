@@ -35,7 +35,7 @@ from fusecap.errors import InputError
 from fusecap.files import written_whole
 
 Work = Callable[[Any], dict[str, Any]]
-Progress = Callable[["Outcome", int, int], None]
+OnOutcome = Callable[["Outcome", int, int], None]
 """Called as each cell ends, with (what became of it, cells done, cells in all)."""
 
 _ONE_THREAD: dict[str, str] = {
@@ -80,7 +80,7 @@ def run_cells(
     versions: Mapping[str, str] | None = None,
     workers: int | None = None,
     ray: str | None = None,
-    progress: Progress | None = None,
+    progress: OnOutcome | None = None,
 ) -> list[Outcome]:
     """Compute `cells`, each once, and return their outcomes in order.
 

@@ -18,8 +18,9 @@ from scipy.spatial.transform import Rotation
 from fusecap.body.shape import BodyShape
 from fusecap.errors import InputError
 from fusecap.evaluate.imu_noise import SimulatedImus
-from fusecap.evaluate.simulator import Person, Progress, Simulation
+from fusecap.evaluate.simulator import Person, Simulation
 from fusecap.files import safe_name, written_whole
+from fusecap.progress import Progress
 from fusecap.sources.calibration_files import aniposelib
 from fusecap.sources.toml_text import quoted
 from fusecap.take import save_take

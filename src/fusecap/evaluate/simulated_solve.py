@@ -7,9 +7,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from fusecap.associate.options import TrackerOptions
-from fusecap.batch.solve import Progress, Solved, solve_instants
+from fusecap.batch.solve import Solved, solve_instants
 from fusecap.body.prior import PosePrior, load_prior
 from fusecap.evaluate.simulator import Simulation
+from fusecap.progress import Progress
 from fusecap.setup import Setup
 from fusecap.solve.estimator import SubjectModel
 from fusecap.solve.options import SolverOptions

@@ -11,7 +11,7 @@ what remains is bit for bit the same. docs/simulation.md lists every fault.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -33,13 +33,11 @@ from fusecap.evaluate.keypoint_noise import (
 )
 from fusecap.evaluate.rig_noise import RigNoise, believed
 from fusecap.geometry.camera import Camera, Rig
+from fusecap.progress import Progress
 from fusecap.sources.keypoint_files import KeypointTrack
 from fusecap.sources.synchronizer import people_at
 from fusecap.take import Take, provenance, take_from_theta
 from fusecap.types import Detections, ImuReading
-
-Progress = Callable[[str, int, int], None]
-"""Called with (what is being simulated, done, in all)."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 
 from fusecap.batch.detect import detector_options
 from fusecap.detect.build import build_detector
@@ -12,12 +11,10 @@ from fusecap.errors import SessionError
 from fusecap.live.devices.open_devices import device_sources
 from fusecap.live.devices.playback_sources import PlaybackOptions, playback_sources
 from fusecap.live.devices.source import SessionClock, Source
+from fusecap.progress import Progress
 from fusecap.setup import SessionSetup, session_setup
 from fusecap.sources.live_address import KeypointFolder, parse_camera_address
 from fusecap.sources.session import CameraSettings, Session
-
-Progress = Callable[[str, int, int], None]
-"""Called with (what is being read or fetched, done, total)."""
 
 
 def open_setup(

@@ -31,6 +31,7 @@ from fusecap.errors import InputError
 from fusecap.motion.files.folder import MotionFolder
 from fusecap.motion.motion import Motion
 from fusecap.motion.retarget import retarget
+from fusecap.progress import Progress
 
 ACKNOWLEDGEMENT = (
     "The data used in this project was obtained from mocap.cs.cmu.edu. The database was created "
@@ -70,9 +71,6 @@ _HELD_OUT_EVERY = 5
 """Where no pattern matches a key, every fifth take is held out."""
 
 _MAX_ANGLE_DEG = {"upper_arm": 160.0, "forearm": 155.0, "hand": 100.0}
-
-Progress = Callable[[int, int, str], None]
-"""Called with the steps done, the steps in all, and what is being done."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,11 +123,11 @@ def train_prior(
     """
     folder = MotionFolder(motion_folder)
     steps = len(folder.keys) + _ITERATIONS
-    report_step = progress or (lambda done, total, text: None)
+    report_step = progress or (lambda what, done, total: None)
 
     takes: list[_Take] = []
     for done, key in enumerate(folder.keys):
-        report_step(done, steps, f"reading {key}")
+        report_step("reading motion", done, steps)
         takes.append(_prepare(key, folder[key], skeleton))
     takes, duplicates = _without_duplicates(takes)
     test = _is_held_out([take.keys for take in takes], held_out)
@@ -148,10 +146,10 @@ def train_prior(
         both,
         clusters * (2 if mirror else 1),
         np.random.default_rng(seed),
-        lambda i: report_step(len(folder.keys) + i, steps, "clustering poses"),
+        lambda i: report_step("clustering poses", len(folder.keys) + i, steps),
     )
     mean, basis, sigma = _principal_components(centres)
-    report_step(steps, steps, "done")
+    report_step("clustering poses", steps, steps)
 
     reports = tuple(
         TakeReport(key=take.key, frames=len(take.poses), explained=e, within=w)

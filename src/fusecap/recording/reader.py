@@ -29,6 +29,7 @@ from mcap.records import Channel, Chunk, Message, Metadata, Schema
 from fusecap.body.shape import BodyShape
 from fusecap.body.skeleton import skeleton_named
 from fusecap.errors import InputError, MotionError
+from fusecap.progress import Progress
 from fusecap.types import CameraSample, Command, CommandKind, Event, ImuSample, Tick
 
 SUFFIX = ".mcap"
@@ -51,9 +52,6 @@ _BROKEN = (
 """What parsing bytes that are not what they should be may raise."""
 
 _Record = Schema | Channel | Message | Metadata
-
-Progress = Callable[[int, int], None]
-"""Called with (bytes read, bytes in all)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -239,7 +237,7 @@ class Recording:
             yield opcode, file.read(length)
             at += _RECORD.size + length
             if progress is not None:
-                progress(at, size)
+                progress(f"reading {self.path.name}", at, size)
         loss.unread_bytes = size - at
 
 

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from fusecap.errors import InputError
+from fusecap.progress import Progress
 from fusecap.sources.video import Video
 
 FILE_NAME = "detection.json"
@@ -90,8 +90,8 @@ class DetectionRecord:
         )
 
 
-def mark(video: Video, progress: Callable[[int, int], None] | None = None) -> VideoMark:
-    """Name and content of a video; reads the whole file and reports (done, total) in MB."""
+def mark(video: Video, progress: Progress | None = None) -> VideoMark:
+    """Name and content of a video; reads the whole file, in MB."""
     digest = hashlib.sha256()
     size = video.path.stat().st_size
     done = 0
@@ -100,7 +100,7 @@ def mark(video: Video, progress: Callable[[int, int], None] | None = None) -> Vi
             digest.update(chunk)
             done += len(chunk)
             if progress is not None:
-                progress(done >> 20, size >> 20)
+                progress(f"reading {video.path.name} MB", done >> 20, size >> 20)
     return VideoMark(
         name=video.path.name,
         bytes=size,

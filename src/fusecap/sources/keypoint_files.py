@@ -12,7 +12,6 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,10 +20,8 @@ import numpy as np
 
 from fusecap.body.landmarks import LANDMARK_SETS, LandmarkSet
 from fusecap.errors import InputError
+from fusecap.progress import Progress
 from fusecap.sources.detection_files import read_record
-
-Progress = Callable[[int, int], None]
-"""Called with (done, total)."""
 
 MAX_FRAME = 10**9
 """Longer numbers are dates or serials."""
@@ -81,7 +78,7 @@ def read_keypoints(
             people.append(np.empty((0, len(landmarks.landmark_names), 3)))
             broken.append(os.path.basename(path))
         if progress is not None:
-            progress(done, len(numbered))
+            progress(f"camera '{name}'", done, len(numbered))
     if len(broken) == len(numbered):
         raise InputError(
             f"{folder}: none of the {len(numbered)} keypoint files can be read "

@@ -8,9 +8,8 @@ session's rate are not interpolated at all.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +19,7 @@ from fusecap.body.landmarks import LandmarkSet, landmark_set_named
 from fusecap.errors import SessionError
 from fusecap.findings import Finding
 from fusecap.geometry.camera import Rig
+from fusecap.progress import Progress
 from fusecap.sources.calibration_files import check_rig, load_rig
 from fusecap.sources.detection_files import read_record
 from fusecap.sources.imu_files import ImuTrack, read_imu
@@ -40,9 +40,6 @@ MAX_INSTANTS = 2_000_000
 """9 hours at 60 Hz: beyond this, clocks do not agree."""
 HASHED_BYTES = 1 << 20
 """Of a larger file only name and size enter the hash."""
-
-Progress = Callable[[str, int, int], None]
-"""Called with (what is being read, done, total)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -283,7 +280,6 @@ def _keypoints(
             f"{session.path}: camera '{camera.name}' has a video but no keypoints yet; run: "
             f"fusecap detect {session.folder}"
         )
-    report = None if progress is None else partial(progress, f"camera '{camera.name}'")
     return read_keypoints(
         camera.keypoints,
         name=camera.name,
@@ -291,7 +287,7 @@ def _keypoints(
         rate_hz=session.camera_rate_hz(camera),
         offset_s=camera.offset_s,
         own_times=camera.rate_hz is None,
-        progress=report,
+        progress=progress,
     )
 
 

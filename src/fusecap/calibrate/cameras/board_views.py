@@ -11,7 +11,7 @@ from __future__ import annotations
 import csv
 import glob
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -25,6 +25,7 @@ from fusecap.calibrate.cameras.board import (
     why_not_found,
 )
 from fusecap.errors import CalibrationError, nearest
+from fusecap.progress import Progress
 from fusecap.sources.video import VIDEO_SUFFIXES, Video
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
@@ -33,7 +34,6 @@ MAX_INSPECTED = 240
 BLURRED = 0.4
 """A view whose edges are this share or less as steep as the camera's median view is not used."""
 
-Progress = Callable[[str, int, int], None]
 _KEPT_FOR_CLUES = 6
 
 

@@ -22,7 +22,7 @@ by the rigid motion that fits the boards best: the spread of centres and directi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -43,6 +43,7 @@ from fusecap.geometry.camera import Camera, Rig
 from fusecap.geometry.projection_derivatives import PARAMETERS, POSE
 from fusecap.geometry.similarity import fitted_similarity
 from fusecap.geometry.triangulation import triangulate
+from fusecap.progress import Progress
 
 MIN_SHARED = 3
 """Instants at which two cameras see the board together, for the pair to count as connected."""
@@ -52,7 +53,6 @@ FOLDS = 5
 RESAMPLES = 10
 """Bootstraps that measure repeatability."""
 
-Progress = Callable[[str, int, int], None]
 Views = Mapping[tuple[int, int], BoardView]
 """By camera and instant."""
 Proposals = Mapping[tuple[int, int], list[np.ndarray]]

@@ -42,6 +42,7 @@ from fusecap.calibrate.verdict import Marks, Verdict
 from fusecap.errors import CalibrationError
 from fusecap.geometry.camera import Camera
 from fusecap.geometry.projection_derivatives import PARAMETERS
+from fusecap.progress import Progress
 
 MIN_IMAGES = 4
 """Fewer do not determine a lens and leave nothing to check it on."""
@@ -63,7 +64,6 @@ MODELS: dict[str, tuple[int, ...]] = {
 }
 """Distortion models by name, and the numbers of a camera that they free."""
 
-Progress = Callable[[str, int, int], None]
 
 _TILTED_DEG = 25.0
 """Boards whose tilts differ by less than this do not tell focal length from distance."""

@@ -34,7 +34,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from fusecap.batch.solve import Progress, solve_instants
+from fusecap.batch.solve import solve_instants
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.body.pose import forward_kinematics, landmarks_in_world
 from fusecap.calibrate.cameras.people_adjust import (
@@ -54,6 +54,7 @@ from fusecap.errors import InputError
 from fusecap.geometry.camera import Rig
 from fusecap.geometry.similarity import Similarity
 from fusecap.geometry.triangulation import ROBUST_SCALE_PX, triangulate
+from fusecap.progress import Progress
 from fusecap.setup import setup_of
 from fusecap.sources.session_data import SessionData
 from fusecap.types import Detections, ImuReading

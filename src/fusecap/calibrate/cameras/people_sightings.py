@@ -20,9 +20,9 @@ from jaxtyping import Float, Int
 
 from fusecap.associate.candidates import CandidateOptions
 from fusecap.associate.options import TrackerOptions
-from fusecap.batch.solve import Progress
 from fusecap.geometry.camera import Rig
 from fusecap.pipeline import Pipeline, observation_of
+from fusecap.progress import Progress
 from fusecap.setup import setup_of
 from fusecap.sources.session_data import SessionData
 from fusecap.sources.view_agreement import disagreement_px, without_distortion

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from fusecap.calibrate.verdict import Marks, Verdict
 from fusecap.errors import CalibrationError
 from fusecap.files import written_whole
 from fusecap.geometry.camera import REFERENCE_WIDTH_PX, Camera
+from fusecap.progress import Progress
 
 GOOD_PX, POOR_PX = 1.0, 3.0
 """Median held-out error of a corner, in pixels of a 1920-pixel-wide image."""
@@ -36,8 +37,6 @@ GOOD_LEFT_OUT, POOR_LEFT_OUT = 0.1, 0.3
 """Share of the views that contradict the rest: beyond a third, which are the right ones is open."""
 GOOD_RESAMPLES, POOR_RESAMPLES = 8, 5
 """Of `RESAMPLES`, those in which all cameras stay connected."""
-
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, kw_only=True)

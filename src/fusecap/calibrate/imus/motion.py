@@ -48,6 +48,7 @@ from fusecap.calibrate.imus.sensor_report import (
 )
 from fusecap.calibrate.imus.tpose import TPOSE_SIGMA_RAD
 from fusecap.errors import InputError
+from fusecap.progress import Progress
 
 SPREAD_RAD = np.radians(5.0)
 """Least standard deviation of sensors' headings about their common one."""
@@ -85,12 +86,9 @@ def calibrate_subject(
     reference: ReferenceMotion,
     worn: Sequence[Worn],
     seen: SeenLandmarks | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> SubjectCalibration:
-    """All steps; raises `InputError` where nothing was seen of the subject or clocks disagree.
-
-    `progress` is told how many of how many steps are done.
-    """
+    """All steps; raises `InputError` where nothing was seen of the subject or clocks disagree."""
     check_reference(reference)
     rotations = sensor_rotations(worn, reference.times_s)
     usable, skipped = [], []
@@ -227,7 +225,7 @@ class _Together:
         priors: Sequence[HeadingPrior],
         sound: Sequence[bool],
         seen: SeenLandmarks | None,
-        progress: Callable[[int, int], None] | None,
+        progress: Progress | None,
     ) -> None:
         self._reference = reference
         self._bones = [reference.skeleton.bone(each.settings.bone) for each in worn]
@@ -235,7 +233,7 @@ class _Together:
         self._priors = priors
         self._sound = sound
         self._seen = seen
-        self._progress = progress or (lambda done, total: None)
+        self._progress = progress or (lambda what, done, total: None)
         if seen is not None:
             self._sensors = sensor_rotations(worn, seen.times_s)
 
@@ -245,15 +243,16 @@ class _Together:
         masks += [partial(_in_half, half=half) for half in (0, 1)]
         whole = self._joined(alone, None)
         parts: list[list[Fit | None]] = []
+        what = f"sensors of {self._reference.subject}"
         for number, mask in enumerate(masks):
-            self._progress(number + 1, len(masks) + 1)
+            self._progress(what, number + 1, len(masks) + 1)
             first: list[Fit | None] = []
             for some, prior in zip(self._pairs, self._priors, strict=True):
                 left = some.where(mask(some.block))
                 enough = (left.block >= 0).sum() >= 3
                 first.append(fit(left, prior) if enough else None)
             parts.append(self._joined(first, mask, whole))
-        self._progress(len(masks) + 1, len(masks) + 1)
+        self._progress(what, len(masks) + 1, len(masks) + 1)
         result = []
         for index, fitted in enumerate(whole):
             assert fitted is not None

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fusecap.batch.solve import Progress, solve_session
+from fusecap.batch.solve import solve_session
 from fusecap.body.landmarks import LANDMARK_SETS
 from fusecap.calibrate.imus.checks import Worn
 from fusecap.calibrate.imus.identify import Identity
@@ -22,6 +21,7 @@ from fusecap.calibrate.imus.motion import (
 from fusecap.calibrate.imus.reference import ReferenceMotion, reference_motion
 from fusecap.calibrate.imus.tpose import TPose, look_at_tpose
 from fusecap.errors import InputError
+from fusecap.progress import Progress
 from fusecap.sources.imu_calibration_files import CalibratedImu
 from fusecap.sources.imu_files.track import ImuTrack
 from fusecap.sources.session import ImuSettings, Session, SubjectSettings
@@ -112,9 +112,8 @@ def calibrate_from_motion(
                 take.subject(subject.name),
                 _some_instants(take, data),
             )
-        show = partial(progress, f"sensors of {subject.name}") if progress else None
         worn = worn_by(session, subject)
-        found.append(calibrate_subject(reference[subject.name], worn, seen, show))
+        found.append(calibrate_subject(reference[subject.name], worn, seen, progress))
     return tuple(found)
 
 

@@ -42,8 +42,8 @@ from fusecap.calibrate.sync.curves import (
 from fusecap.calibrate.sync.signals import View
 from fusecap.geometry.camera import Rig
 from fusecap.geometry.epipolar import essential_matrix
+from fusecap.progress import Progress
 
-Progress = Callable[[str, int, int], None]
 Pair = tuple[int, int]
 
 MIN_DRIFT_S = 60.0

@@ -7,7 +7,7 @@ does not, so that a second run finds what the first one found.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,6 +28,7 @@ from fusecap.calibrate.sync.signals import View, common_smooth_s, view_of
 from fusecap.calibrate.sync.stamp import Stamp
 from fusecap.errors import CalibrationError, InputError
 from fusecap.geometry.camera import Rig
+from fusecap.progress import Progress
 from fusecap.sources.keypoint_files import KeypointTrack
 from fusecap.sources.session import Session, SubjectSettings
 from fusecap.sources.session_data import (
@@ -40,8 +41,6 @@ from fusecap.sources.session_data import (
 )
 from fusecap.sources.sync_files import Clock, Clocks
 from fusecap.take import Take
-
-Progress = Callable[[str, int, int], None]
 
 MIN_SPEED = 0.05
 """Of a view's people in body extents per second, below which nobody moves."""

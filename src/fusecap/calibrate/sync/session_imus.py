@@ -6,7 +6,7 @@ sensors of a subject have one clock, but for those that clearly have another.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -26,12 +26,11 @@ from fusecap.calibrate.sync.imus import Comparison, Filmed, ImuClock, Worn, unkn
 from fusecap.calibrate.sync.signals import MAX_GAP_S
 from fusecap.calibrate.sync.stamp import ERROR_S, Stamp, find_stamp
 from fusecap.calibrate.verdict import Verdict
+from fusecap.progress import Progress
 from fusecap.sources.imu_files import ImuTrack
 from fusecap.sources.session import Session, SubjectSettings
 from fusecap.sources.session_data import open_imus
 from fusecap.take import Take
-
-Progress = Callable[[str, int, int], None]
 
 SAME_CLOCK_S = 0.06
 """Sensors that lie within this of each other (or `SIGNIFICANT` standard errors) share a clock."""

@@ -13,13 +13,14 @@ import numpy as np
 from jaxtyping import Float
 
 from fusecap.associate.options import TrackerOptions
-from fusecap.batch.solve import Progress, Solved, solve_instants
+from fusecap.batch.solve import Solved, solve_instants
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.body.pose import landmarks_in_world
 from fusecap.body.prior import load_prior
 from fusecap.body.skeleton import PAPER21, Skeleton
 from fusecap.errors import InputError
 from fusecap.geometry.camera import Rig
+from fusecap.progress import Progress
 from fusecap.setup import Setup
 from fusecap.solve.estimator import SubjectModel
 from fusecap.solve.options import SolverOptions, Weights

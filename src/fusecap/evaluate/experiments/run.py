@@ -21,7 +21,7 @@ from fusecap.evaluate.experiments.table2 import TABLE2
 from fusecap.evaluate.experiments.table3 import TABLE3
 from fusecap.evaluate.experiments.table4 import TABLE4
 from fusecap.evaluate.experiments.tuning import TUNING
-from fusecap.evaluate.runner import Outcome, Progress, code_version, run_cells
+from fusecap.evaluate.runner import OnOutcome, Outcome, code_version, run_cells
 from fusecap.evaluate.twin import TWIN_VERSION
 from fusecap.files import written_whole
 
@@ -61,7 +61,7 @@ def evaluate(
     command: str = "",
     workers: int | None = None,
     ray: str | None = None,
-    progress: Progress | None = None,
+    progress: OnOutcome | None = None,
 ) -> Evaluation:
     """Run experiment `name`; cells already in `out`/cells are not solved again."""
     experiment = EXPERIMENTS[name]

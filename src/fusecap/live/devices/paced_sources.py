@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from fusecap.live.devices.source import Deliver, Delivery, SessionClock, SourceCounts
+from fusecap.progress import Progress
 from fusecap.sources.imu_files import ImuTrack
 from fusecap.sources.keypoint_files import KeypointTrack
 from fusecap.sources.video import Video
@@ -156,7 +157,7 @@ class HeldPictures(_Stored):
         video: Video,
         times_s: Float[np.ndarray, " f"],
         shown: Int[np.ndarray, " n"],
-        progress: Callable[[int, int], None] | None,
+        progress: Progress | None,
     ) -> None:
         wanted = set(shown.tolist())
         self._camera = camera
@@ -166,7 +167,7 @@ class HeldPictures(_Stored):
             self._images.append(frame.image)
             numbers.append(frame.number)
             if progress is not None:
-                progress(len(numbers), len(wanted))
+                progress(f"camera '{name}'", len(numbers), len(wanted))
         super().__init__(f"camera '{name}'", times_s[numbers])
 
     def _item(self, row: int, stamp_ns: int) -> CameraImage:

@@ -7,9 +7,8 @@ acceleration depends on the direction of time.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -25,13 +24,11 @@ from fusecap.live.devices.paced_sources import (
     Sensors,
 )
 from fusecap.live.devices.source import SessionClock, Source
+from fusecap.progress import Progress
 from fusecap.sources.keypoint_files import read_keypoints
 from fusecap.sources.session import CameraSettings, Session
 from fusecap.sources.session_data import common_landmarks, open_imus, session_clocks
 from fusecap.sources.video import Video
-
-Progress = Callable[[str, int, int], None]
-"""Called with (what is being read, done, total)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -137,7 +134,6 @@ def _cameras(
     landmarks = common_landmarks(session)
     clocks = session_clocks(session)
     for index, camera in enumerate(session.cameras):
-        report = None if progress is None else partial(progress, f"camera '{camera.name}'")
         clock = clocks.camera(camera.name)
         if camera.keypoints is not None and landmarks is not None:
             track = read_keypoints(
@@ -147,7 +143,7 @@ def _cameras(
                 rate_hz=session.camera_rate_hz(camera),
                 offset_s=camera.offset_s,
                 own_times=camera.rate_hz is None,
-                progress=report,
+                progress=progress,
             )
             yield Keypoints(index, track, clock.session_s(track.times_s))
         elif camera.video is not None:
@@ -155,7 +151,7 @@ def _cameras(
             times_s = clock.session_s(_exposed_s(video, camera))
             shown = _thinned(times_s, options.image_rate_hz)
             if options.in_memory:
-                yield HeldPictures(index, camera.name, video, times_s, shown, report)
+                yield HeldPictures(index, camera.name, video, times_s, shown, progress)
             elif options.there_and_back:
                 raise InputError(
                     f"camera '{camera.name}': a video is played backwards only from memory; "
