@@ -18,12 +18,13 @@ import pytest
 
 from fusecap.body.landmarks import landmark_set_named
 from fusecap.errors import InputError
+from fusecap.live.devices import grabbers
 from fusecap.live.devices.cameras import UNSTAMPED_DELAY_S, CameraSource
 from fusecap.live.devices.genicam import GenICamGrabber
 from fusecap.live.devices.grabbers import OpenCvGrabber, Picture, open_url, open_v4l2
 from fusecap.live.devices.imus_lsl import LslImus
 from fusecap.live.devices.imus_udp import UdpImus
-from fusecap.live.devices.open_devices import device_sources, grabbers
+from fusecap.live.devices.open_devices import device_sources
 from fusecap.live.devices.openpose_folder import OpenPoseSource
 from fusecap.live.devices.sensor_feed import SensorFeed
 from fusecap.live.devices.source import SessionClock, SourceLost
@@ -634,8 +635,12 @@ def test_session_without_live_keys_has_no_sources(tmp_path):
     assert device_sources(load_session(write_session(tmp_path)), SessionClock()) == []
 
 
-def test_missing_harvesters_is_named_before_anything_starts(tmp_path):
+def test_missing_harvesters_is_named_before_anything_starts(tmp_path, monkeypatch):
     file = write_session(tmp_path)
     edit(file, 'keypoints = "keypoints/cam0"', 'live = "genicam:1"')
+    monkeypatch.setitem(sys.modules, "harvesters.core", None)
     with pytest.raises(InputError, match="pip install"):
         device_sources(load_session(file), SessionClock())
+    monkeypatch.setitem(sys.modules, "harvesters.core", types.ModuleType("core"))
+    (source,) = device_sources(load_session(file), SessionClock())
+    assert source.name == "camera 'cam0'"

@@ -494,6 +494,15 @@ def test_a_full_inbox_drops_the_oldest_sensor_sample():
     assert inbox.dropped == 1
 
 
+def test_a_full_inbox_without_sensor_samples_drops_the_oldest():
+    inbox = Inbox(SessionClock(), capacity=2)
+    for number in range(4):
+        inbox.put(camera_sample(number))
+    left = [item.timestamp_ns for item, _ in inbox.take_all() if not isinstance(item, Command)]
+    assert left == [2, 3]
+    assert inbox.dropped == 2
+
+
 @given(st.lists(st.floats(1e-5, 99.0), min_size=1, max_size=200), st.floats(0.01, 1.0))
 def test_quantiles_are_within_three_percent(durations, share):
     histogram = Histogram()

@@ -18,7 +18,7 @@ from fusecap.engine.engine import LiveStep
 from fusecap.errors import InputError
 from fusecap.live.devices.source import SessionClock
 from fusecap.live.latency import EXPOSURE_TO_PACKET, LatencyBook
-from fusecap.live.stream_process import StreamProcess
+from fusecap.live.stream_process import QUEUE, StreamProcess
 from fusecap.pipeline import Step
 from fusecap.streams.target import Target
 from fusecap.types import Detections, Estimate, Status
@@ -103,6 +103,23 @@ def test_instants_before_the_end_are_sent_and_the_last_report_comes(receiver):
     streams.on_step(step_at(1, 0.5), 1)
     streams.close()
     assert json.loads(receiver.recv(8192))["anna"] and streams.outputs[0].poses == 1
+
+
+@pytest.mark.slow
+def test_child_that_lies_behind_loses_the_oldest_instants_and_sends_the_newest(receiver):
+    streams = streams_to(livelink(receiver))
+    os.kill(streams._process.pid, signal.SIGSTOP)
+    for number in range(1, 101):
+        streams.on_step(step_at(number, 0.01 * number), number)
+    os.kill(streams._process.pid, signal.SIGCONT)
+    streams.close()
+    (output,) = streams.outputs
+    sent_cm = [
+        round(json.loads(receiver.recv(8192))["anna"][0]["Location"][0])
+        for _ in range(output.poses)
+    ]
+    assert sent_cm == sorted(sent_cm) and sent_cm[-QUEUE:] == [98, 99, 100]
+    assert output.stream_status().dropped == 100 - output.poses > 0
 
 
 @pytest.mark.slow

@@ -25,7 +25,7 @@ from fusecap.errors import InputError, TakeError
 from fusecap.streams.play_take import TakePlayer, play
 from fusecap.streams.streams import WebSocketStream, open_stream
 from fusecap.streams.target import Target, parse_target
-from fusecap.streams.transports import Counts, UdpSender, WebSocketServer
+from fusecap.streams.transports import CLIENT_QUEUE, Counts, UdpSender, WebSocketServer
 from fusecap.take import save_take
 from motions import person, take_of, walk
 
@@ -391,6 +391,28 @@ def test_stalled_client_loses_its_oldest_frames_and_holds_nobody():
             reader.join()
     assert counts.dropped > 100
     assert received[-1][:6] == "000199"
+
+
+def test_client_that_lies_behind_gets_the_newest_frames_once_it_reads_again():
+    counts = Counts()
+    port = free_port()
+    server = WebSocketServer(HOST, port, counts)
+    with socket.create_connection((HOST, port)) as client:
+        client.sendall(HANDSHAKE)
+        client.recv(20)
+        while not server.clients:
+            threading.Event().wait(0.005)
+        for number in range(100):
+            server.publish(f"<{number:03d}>" + "x" * 200_000, None)
+            threading.Event().wait(0.001)
+        client.settimeout(2.0)
+        heard = bytearray()
+        with contextlib.suppress(TimeoutError):
+            while b"<099>" not in heard[-300_000:]:
+                heard += client.recv(1 << 20)
+        server.close()
+    assert counts.dropped > 50
+    assert re.findall(rb"<(\d+)>", heard)[-CLIENT_QUEUE:] == [b"096", b"097", b"098", b"099"]
 
 
 def test_noise_on_the_port_is_not_answered_with_a_traceback(served, capfd):
