@@ -27,8 +27,9 @@ import numpy as np
 
 from fusecap import load_session, open_session
 from fusecap.batch.solve import solve_session
-from fusecap.calibrate.cameras.people import PeopleCalibration, check_rigs, refine_from_people
+from fusecap.calibrate.cameras.people import check_rigs, refine_from_people
 from fusecap.calibrate.cameras.people_gauge import align, motions
+from fusecap.calibrate.cameras.people_report import PeopleCalibration
 from fusecap.evaluate.demo_scene import demo_scene
 from fusecap.evaluate.rig_noise import RigNoise, believed
 from fusecap.evaluate.score import score_take

@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from board_images import CHARUCO, camera, pose, seen, shots
-from fusecap.calibrate.cameras import extrinsics, people
+from fusecap.calibrate.cameras import extrinsics, extrinsics_checks, people_report
 from fusecap.calibrate.cameras.board import CHECKERBOARD, Board
 from fusecap.calibrate.cameras.bundle_adjustment import adjust, stack_views
-from fusecap.calibrate.cameras.people import CameraChange, Fit, PeopleCalibration
+from fusecap.calibrate.cameras.people_report import CameraChange, Fit, PeopleCalibration
 from fusecap.calibrate.cameras.report import CameraReport, ScaleCheck, verdict_of
 from fusecap.calibrate.verdict import Verdict, worst
 from fusecap.errors import CalibrationError, InputError
@@ -103,7 +103,7 @@ def test_resample_that_falls_apart_is_left_out_of_the_spread(rng, monkeypatch):
     views = extrinsics.views_of(found)
     solution = extrinsics.solve(lenses, views, CHARUCO)
     monkeypatch.setattr(extrinsics, "outlying", lambda rms_px: rms_px >= 0)
-    repeated = extrinsics.repeatability(solution, views, CHARUCO, resamples=3)
+    repeated = extrinsics_checks.repeatability(solution, views, CHARUCO, resamples=3)
     assert repeated.resamples == 0
     assert np.isnan(repeated.centre_mm).all()
 
@@ -207,7 +207,7 @@ def notes_of(*changes):
         notes=(),
         residuals_px={},
     )
-    return people._notes(result, rig, np.ones((50, len(changes)), dtype=bool))
+    return people_report.notes_on(result, rig, np.ones((50, len(changes)), dtype=bool))
 
 
 def test_calibration_from_people_without_a_flaw_has_no_notes():

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from board_images import CHARUCO, CHECKERBOARD, camera, pose, rendered, seen, shots
-from fusecap.calibrate.cameras import bundle_adjustment, extrinsics
+from fusecap.calibrate.cameras import bundle_adjustment, extrinsics, extrinsics_checks
 from fusecap.calibrate.cameras.board import Board
 from fusecap.calibrate.cameras.board_views import read_shots, read_timestamps
 from fusecap.calibrate.cameras.bundle_adjustment import adjust, residuals_px, stack_views
@@ -354,7 +354,9 @@ def test_a_real_rig_agrees_with_its_reference_calibration(data_dir):
     assert np.linalg.norm(onto.points(ours) - theirs, axis=1).max() < 0.01 * size
 
     def rms(cameras):
-        miss = np.concatenate([v.fitted_px for v in extrinsics.predicted(cameras, views, board)])
+        miss = np.concatenate(
+            [v.fitted_px for v in extrinsics_checks.predicted(cameras, views, board)]
+        )
         return np.sqrt((miss**2).mean())
 
     assert rms(solution.cameras) < 1.1 * rms(reference)

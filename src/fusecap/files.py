@@ -6,9 +6,12 @@ import contextlib
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 from fusecap.errors import TakeError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @contextlib.contextmanager
@@ -31,6 +34,32 @@ def written_whole(path: Path) -> Iterator[BinaryIO]:
             part.unlink(missing_ok=True)
     except OSError as error:
         raise TakeError(f"cannot write {path}: {error.strerror or error}") from error
+
+
+def write_whole(path: Path, content: str | bytes) -> None:
+    """All at once, text as UTF-8; fails as `written_whole`."""
+    with written_whole(path) as file:
+        file.write(content.encode() if isinstance(content, str) else content)
+
+
+def write_picture(figure: Figure, path: Path) -> None:
+    """A PNG; fails as `written_whole`."""
+    with written_whole(path) as file:
+        figure.savefig(file, dpi=80, format="png")
+
+
+def check_writable(path: Path) -> None:
+    """Before the work that fills it: raises `TakeError` where no file could be written here."""
+    folder = next(above for above in path.absolute().parents if above.exists())
+    if path.is_dir():
+        reason = "it is a folder"
+    elif not folder.is_dir():
+        reason = f"{folder} is not a folder"
+    elif not os.access(folder, os.W_OK):
+        reason = f"no permission to write in {folder}"
+    else:
+        return
+    raise TakeError(f"cannot write {path}: {reason}")
 
 
 def safe_name(name: str) -> str:

@@ -104,7 +104,8 @@ def extrinsics(
             "goes with --from-people; boards have --refine-intrinsics", param_hint="--refine"
         )
     from fusecap.calibrate.cameras.board import read_board
-    from fusecap.calibrate.cameras.report import calibrate_rig, plot_rig
+    from fusecap.calibrate.cameras.report import calibrate_rig
+    from fusecap.calibrate.pictures import plot_rig
     from fusecap.sources.calibration_files.writer import write_rig
 
     if not sources or board is None:

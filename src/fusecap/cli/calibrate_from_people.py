@@ -12,7 +12,7 @@ from fusecap.cli.calibrations import plain, print_files, print_verdict
 from fusecap.cli.common import check_choice, console, print_json, progress
 
 if TYPE_CHECKING:
-    from fusecap.calibrate.cameras.people import PeopleCalibration
+    from fusecap.calibrate.cameras.people_report import PeopleCalibration
 
 REFINE = ("focal", "centre", "distortion")
 
@@ -33,7 +33,7 @@ def from_people(
         check_choice("--refine", name, REFINE)
 
     from fusecap.calibrate.cameras.people import refine_from_people
-    from fusecap.calibrate.cameras.people_plot import plot_residuals
+    from fusecap.calibrate.pictures import plot_people
     from fusecap.sources.calibration_files.writer import write_rig
     from fusecap.sources.session import load_session
     from fusecap.sources.session_data import open_session
@@ -46,7 +46,7 @@ def from_people(
         files += write_rig(out, found.rig, notes=_origin(found, data.session.settings.name))
     if picture:
         image = out.with_suffix(".png")
-        plot_residuals(found, image)
+        plot_people(found, image)
         files.append(image)
     if as_json:
         print_json(_as_json(found, files))

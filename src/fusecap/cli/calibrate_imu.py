@@ -89,8 +89,8 @@ def imu(
 def _report(found: tuple[SubjectCalibration, ...], out: Path, as_json: bool) -> None:
     from dataclasses import asdict
 
-    from fusecap.calibrate.imus.plot import plot_residuals
     from fusecap.calibrate.imus.session import calibrated_imus
+    from fusecap.calibrate.pictures import plot_sensors
     from fusecap.files import safe_name
 
     imus = calibrated_imus(found)
@@ -99,7 +99,7 @@ def _report(found: tuple[SubjectCalibration, ...], out: Path, as_json: bool) -> 
     for each in found:
         if each.sensors:
             picture = out.with_name(f"{out.stem}_{safe_name(each.subject)}.png")
-            plot_residuals(each, picture)
+            plot_sensors(each, picture)
             files.append(picture)
     if as_json:
         subjects = [

@@ -65,7 +65,7 @@ def intrinsics(
     from fusecap.calibrate.cameras.board import read_board
     from fusecap.calibrate.cameras.board_views import read_shots
     from fusecap.calibrate.cameras.intrinsics import MODELS, calibrate_intrinsics
-    from fusecap.calibrate.cameras.report import plot_lenses
+    from fusecap.calibrate.pictures import plot_lenses
     from fusecap.geometry.camera import Rig
     from fusecap.sources.calibration_files.writer import write_rig
 

@@ -36,8 +36,8 @@ def shape(
     from dataclasses import asdict
 
     from fusecap.batch.solve import SessionInstants
+    from fusecap.calibrate.pictures import plot_bodies
     from fusecap.calibrate.shape import calibrate_shape, shape_toml
-    from fusecap.calibrate.shape_plot import plot_bodies
     from fusecap.files import written_whole
     from fusecap.setup import setup_of
     from fusecap.sources.session import load_session

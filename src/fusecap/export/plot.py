@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from fusecap.body.shape import end_offsets_m
-from fusecap.files import written_whole
+from fusecap.files import write_picture
 from fusecap.take import Take
 
 _VIEWS = {
@@ -36,8 +36,7 @@ def plot_take(take: Take, frames: Sequence[int], path: Path | str) -> None:
             _dress(ax, view, f"{take.time_s[frame]:.2f} s, {title}")
         if row[0].get_legend_handles_labels()[0]:
             row[0].legend(loc="upper right", fontsize=8)
-    with written_whole(Path(path)) as file:
-        figure.savefig(file, dpi=80, format="png")
+    write_picture(figure, Path(path))
 
 
 def _draw(

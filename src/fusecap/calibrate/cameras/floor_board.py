@@ -12,7 +12,7 @@ from scipy.optimize import OptimizeResult, least_squares
 from scipy.spatial.transform import Rotation
 
 from fusecap.calibrate.cameras.board import Board, BoardView
-from fusecap.calibrate.cameras.planar_pose import planar_poses
+from fusecap.calibrate.cameras.first_poses import planar_poses
 from fusecap.errors import CalibrationError
 from fusecap.geometry.camera import REFERENCE_WIDTH_PX, Camera, Rig
 from fusecap.geometry.projection_derivatives import projection_derivatives

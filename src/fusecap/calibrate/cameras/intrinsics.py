@@ -27,15 +27,13 @@ from scipy.spatial.transform import Rotation
 from fusecap.calibrate.cameras.board import Board, BoardView
 from fusecap.calibrate.cameras.board_views import CameraShots, Shot, diverse
 from fusecap.calibrate.cameras.bundle_adjustment import (
+    RAYLEIGH_MEDIAN,
     Corners,
     adjust,
-    residuals_px,
-    stack_views,
-)
-from fusecap.calibrate.cameras.robust import (
-    RAYLEIGH_MEDIAN,
     outlying,
+    residuals_px,
     robust_scale_px,
+    stack_views,
     view_rms_px,
 )
 from fusecap.calibrate.verdict import Marks, Verdict

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
-from fusecap.calibrate.cameras.robust import RAYLEIGH_MEDIAN
+from fusecap.calibrate.cameras.bundle_adjustment import RAYLEIGH_MEDIAN
 from fusecap.geometry.camera import Camera, Rig
 from fusecap.geometry.projection_derivatives import PARAMETERS, moved, projection_derivatives
 

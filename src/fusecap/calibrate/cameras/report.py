@@ -1,24 +1,20 @@
-"""What speaks for a calibration of several cameras, and a picture of it."""
+"""What speaks for a calibration of several cameras."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
-from fusecap.calibrate.cameras import extrinsics
+from fusecap.calibrate.cameras import extrinsics, extrinsics_checks
 from fusecap.calibrate.cameras.board import Board
 from fusecap.calibrate.cameras.board_views import CameraShots
-from fusecap.calibrate.cameras.extrinsics import HeldOut, Repeatability, ScaleCheck, Solution
-from fusecap.calibrate.cameras.intrinsics import Intrinsics, coverage_cells
+from fusecap.calibrate.cameras.extrinsics import Solution
+from fusecap.calibrate.cameras.extrinsics_checks import HeldOut, Repeatability, ScaleCheck
+from fusecap.calibrate.cameras.intrinsics import coverage_cells
 from fusecap.calibrate.verdict import Marks, Verdict
 from fusecap.errors import CalibrationError
-from fusecap.files import written_whole
 from fusecap.geometry.camera import REFERENCE_WIDTH_PX, Camera
 from fusecap.progress import Progress
 
@@ -131,10 +127,10 @@ def calibrate_rig(
     progress("all cameras at once", 0, 1)
     solution = extrinsics.solve(cameras, views, board, refine_intrinsics=refine_intrinsics)
     progress("all cameras at once", 1, 1)
-    held_out, scale = extrinsics.held_out(
+    held_out, scale = extrinsics_checks.held_out(
         cameras, views, board, refine_intrinsics=refine_intrinsics, progress=progress
     )
-    repeated = extrinsics.repeatability(
+    repeated = extrinsics_checks.repeatability(
         solution,
         views,
         board,
@@ -288,8 +284,8 @@ def verdict_of(
         -resamples,
         -GOOD_RESAMPLES,
         -POOR_RESAMPLES,
-        f"only {resamples} of {extrinsics.RESAMPLES} resampled calibrations connect all cameras: "
-        "record more boards that cameras see together",
+        f"only {resamples} of {extrinsics_checks.RESAMPLES} resampled calibrations connect all "
+        "cameras: record more boards that cameras see together",
     )
     return marks.verdict, tuple(marks.advice)
 
@@ -297,114 +293,6 @@ def verdict_of(
 def _scaled_px(camera: CameraReport) -> float:
     """Median held-out error, in pixels of a 1920-pixel-wide image."""
     return camera.held_out_median_px * camera.pixel_scale
-
-
-def plot_rig(calibration: RigCalibration, found: Sequence[CameraShots], path: Path) -> None:
-    """Corners of every camera, coloured by their held-out error, and the rig; a PNG."""
-    solution = calibration.solution
-    columns = min(4, len(found))
-    rows = -(-len(found) // columns)
-    figure = Figure(figsize=(4.4 * columns, 3.2 * rows + 4.2), layout="constrained")
-    grid = figure.add_gridspec(rows + 1, columns, height_ratios=[3.2] * rows + [4.2])
-    miss = {(view.camera, view.instant): view.fitted_px for view in calibration.held_out}
-    every = np.concatenate([np.zeros(1), *miss.values()])
-    top = max(1.0, float(np.percentile(every, 95)))
-    for index, shots in enumerate(found):
-        ax = figure.add_subplot(grid[index // columns, index % columns])
-        pixels, error = [np.zeros((0, 2))], [np.zeros(0)]
-        for shot in shots.shots:
-            if (index, shot.instant) in miss:
-                pixels.append(shot.view.pixels)
-                error.append(miss[index, shot.instant])
-        seen = _draw_image(ax, shots.size_px, np.concatenate(pixels), np.concatenate(error), top)
-        row = calibration.report.cameras[index]
-        ax.set_title(f"{shots.name}: {row.held_out_median_px:.2f} px median", fontsize=9)
-        if index == len(found) - 1:
-            figure.colorbar(seen, ax=ax, label="held-out error [px]")
-    ax = figure.add_subplot(grid[rows, :])
-    _draw_rig(ax, solution)
-    _save(figure, path)
-
-
-def plot_lenses(lenses: Sequence[Intrinsics], found: Sequence[CameraShots], path: Path) -> None:
-    """Where each camera saw corners, coloured by their image's held-out error; a PNG."""
-    columns = min(4, len(found))
-    rows = -(-len(found) // columns)
-    figure = Figure(figsize=(4.4 * columns, 3.4 * rows), layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False)
-    for ax in axes.ravel()[len(found) :]:
-        ax.set_axis_off()
-    top = max([1.0, *(2 * lens.held_out_px for lens in lenses)])
-    for ax, lens, shots in zip(axes.ravel(), lenses, found, strict=False):
-        by_label = {image.label: image for image in lens.images}
-        used = [shot for shot in shots.shots if shot.label in by_label]
-        error = [np.full(len(s.view), by_label[s.label].held_out_px) for s in used]
-        seen = _draw_image(
-            ax,
-            shots.size_px,
-            np.concatenate([np.zeros((0, 2)), *(s.view.pixels for s in used)]),
-            np.concatenate([np.zeros(0), *error]),
-            top,
-        )
-        ax.set_title(
-            f"{shots.name}: {lens.held_out_px:.2f} px held out, "
-            f"{100 * lens.coverage:.0f} % covered, {lens.verdict}",
-            fontsize=9,
-        )
-        figure.colorbar(seen, ax=ax, label="error of the image [px]")
-    _save(figure, path)
-
-
-def _draw_image(
-    ax: Axes,
-    size_px: tuple[int, int],
-    pixels: Float[np.ndarray, "n 2"],
-    error: Float[np.ndarray, " n"],
-    top: float,
-):
-    width, height = size_px
-    seen = ax.scatter(pixels[:, 0], pixels[:, 1], c=error, s=5, cmap="viridis", vmin=0.0, vmax=top)
-    ax.set_xlim(0, width)
-    ax.set_ylim(height, 0)
-    ax.set_aspect("equal")
-    ax.set_xticks(np.linspace(0, width, 9), minor=True)
-    ax.set_yticks(np.linspace(0, height, 7), minor=True)
-    ax.set_xticks([0, width])
-    ax.set_yticks([0, height])
-    ax.grid(which="minor", alpha=0.3)
-    return seen
-
-
-def _draw_rig(ax: Axes, solution: Solution) -> None:
-    """In the plane of the cameras' widest spread."""
-    centres = np.array([camera.position_in_world for camera in solution.cameras])
-    boards = np.array([pose[:3, 3] for pose in solution.boards.values()])
-    middle = centres.mean(axis=0)
-    _, _, axes = np.linalg.svd(np.vstack([centres, boards]) - middle, full_matrices=False)
-    flat = (centres - middle) @ axes[:2].T
-    there = (boards - middle) @ axes[:2].T
-    ax.scatter(there[:, 0], there[:, 1], s=6, color="0.6", label="boards")
-    ax.scatter(flat[:, 0], flat[:, 1], s=40, color="C3", marker="s", label="cameras")
-    for camera, place in zip(solution.cameras, flat, strict=True):
-        ahead = 0.3 * axes[:2] @ camera.rotation[2]
-        ax.annotate(
-            "",
-            xy=(place[0] + ahead[0], place[1] + ahead[1]),
-            xytext=(place[0], place[1]),
-            arrowprops={"arrowstyle": "->", "color": "C3"},
-        )
-        ax.annotate(camera.name, (place[0], place[1]), xytext=(5, 5), textcoords="offset points")
-    ax.set_aspect("equal", adjustable="datalim")
-    ax.set_title("the rig, seen along the direction in which it is thinnest", fontsize=9)
-    ax.set_xlabel("[m]")
-    ax.set_ylabel("[m]")
-    ax.grid(alpha=0.3)
-    ax.legend(fontsize=8)
-
-
-def _save(figure: Figure, path: Path) -> None:
-    with written_whole(path) as file:
-        figure.savefig(file, dpi=90, format="png")
 
 
 def _rms(errors: Sequence[np.ndarray]) -> float:

@@ -58,7 +58,6 @@ recordings (docs/imu_calibration.md)."""
 MAX_ITERATIONS = 8
 CONVERGED_RAD = 1e-3
 _CAUCHY = 4.6
-_AT_JOINT_M = 0.01
 _UP = np.array([0.0, 1.0, 0.0])
 
 

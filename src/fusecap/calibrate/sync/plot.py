@@ -12,12 +12,12 @@ from matplotlib.figure import Figure
 from fusecap.calibrate.sync.clock_rows import ClockRow
 from fusecap.calibrate.sync.curves import Curve
 from fusecap.calibrate.sync.session import Synchronisation
-from fusecap.files import written_whole
+from fusecap.files import write_picture
 
 _CLOSE_UP_S = 3.0
 
 
-def draw(found: Synchronisation, path: Path | str) -> None:
+def draw(found: Synchronisation, path: Path) -> None:
     """A PNG: a row per clock with its cost over the offset, then rows of signals laid together."""
     curves: list[tuple[ClockRow, Curve | None]] = []
     cameras = [row for row in found.rows if row.kind == "camera"]
@@ -48,8 +48,7 @@ def draw(found: Synchronisation, path: Path | str) -> None:
     if signals:
         axes[-1][0].set_xlabel("session time [s]")
         axes[-1][1].set_xlabel("session time [s], where most moves")
-    with written_whole(Path(path)) as file:
-        figure.savefig(file, dpi=80, format="png")
+    write_picture(figure, path)
 
 
 Signals = tuple[str, str, dict[str, tuple[np.ndarray, np.ndarray]]]
