@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from fusecap.associate.options import TrackerOptions as TrackerOptions
     from fusecap.associate.tracker import Tracker as Tracker
-    from fusecap.associate.tracker import TrackerOptions as TrackerOptions
     from fusecap.batch.solve import Solved as Solved
     from fusecap.batch.solve import SolveReport as SolveReport
     from fusecap.batch.solve import solve_session as solve_session
