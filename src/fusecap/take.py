@@ -27,6 +27,7 @@ from fusecap.body.shape import REFERENCE_HEIGHT_M, BodyShape
 from fusecap.body.skeleton import Skeleton
 from fusecap.errors import TakeError, nearest
 from fusecap.files import written_whole
+from fusecap.geometry.quaternions import from_wxyz, to_wxyz
 from fusecap.types import Estimate, Status
 
 FORMAT_VERSION = 1
@@ -345,12 +346,10 @@ def _take_from_arrays(arrays: Mapping[str, np.ndarray]) -> Take:
 
 
 def _wxyz_from_matrix(rotation: Float[np.ndarray, "t b 3 3"]) -> Float[np.ndarray, "t b 4"]:
-    xyzw = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_quat(canonical=True)
-    return np.roll(xyzw, 1, axis=1).reshape(*rotation.shape[:2], 4)
+    return to_wxyz(Rotation.from_matrix(rotation.reshape(-1, 3, 3))).reshape(*rotation.shape[:2], 4)
 
 
 def _matrix_from_wxyz(quaternion: Float[np.ndarray, "t b 4"]) -> Float[np.ndarray, "t b 3 3"]:
-    xyzw = np.roll(quaternion.reshape(-1, 4), -1, axis=1)
-    if len(xyzw) == 0:
+    if quaternion.size == 0:
         return np.empty((*quaternion.shape[:2], 3, 3))
-    return Rotation.from_quat(xyzw).as_matrix().reshape(*quaternion.shape[:2], 3, 3)
+    return from_wxyz(quaternion.reshape(-1, 4)).as_matrix().reshape(*quaternion.shape[:2], 3, 3)

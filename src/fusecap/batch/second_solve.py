@@ -19,6 +19,7 @@ from fusecap.batch.solve import Solved, solve_instants
 from fusecap.engine.cameras import Cameras
 from fusecap.engine.sensors import Sensors
 from fusecap.errors import InputError
+from fusecap.geometry.quaternions import to_wxyz
 from fusecap.progress import Progress
 from fusecap.recording.reader import RecordedEvent, Recording
 from fusecap.setup import setup_of
@@ -145,7 +146,7 @@ def _with_mountings(session: Session, mountings: Mapping[tuple[str, str], np.nda
         for imu in subject.imus:
             bone_from_imu = mountings.get((subject.name, imu.bone))
             if bone_from_imu is not None:
-                x, y, z, w = Rotation.from_matrix(bone_from_imu).as_quat().tolist()
+                w, x, y, z = to_wxyz(Rotation.from_matrix(bone_from_imu)).tolist()
                 imu = imu.model_copy(update={"bone_from_imu_wxyz": (w, x, y, z)})
             imus.append(imu)
         subjects.append(subject.model_copy(update={"imus": tuple(imus)}))

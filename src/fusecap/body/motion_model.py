@@ -15,9 +15,9 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from fusecap.errors import InputError
+from fusecap.geometry.quaternions import from_wxyz
 
 
 class ShippedMotion(NamedTuple):
@@ -70,5 +70,5 @@ def theta_of_channels(channels: Float[np.ndarray, "s t c"]) -> Float[np.ndarray,
     """Poses from root position [m] and one quaternion wxyz of any length per bone, c = 3 + 4B."""
     people, frames = channels.shape[:2]
     quaternions = channels[..., 3:].reshape(-1, 4)
-    vectors = Rotation.from_quat(quaternions[:, [1, 2, 3, 0]]).as_rotvec()
+    vectors = from_wxyz(quaternions).as_rotvec()
     return np.concatenate([channels[..., :3], vectors.reshape(people, frames, -1)], axis=-1)

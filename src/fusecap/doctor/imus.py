@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from fusecap.errors import FusecapError
 from fusecap.findings import Findings
+from fusecap.geometry.quaternions import from_wxyz
 from fusecap.sources.imu_files import read_imu
 from fusecap.sources.imu_files.track import GRAVITY_M_S2, ImuTrack
 from fusecap.sources.session import ImuSettings, Session
@@ -81,7 +81,7 @@ def _check_gravity(where: str, imu: ImuSettings, track: ImuTrack, findings: Find
     measured = np.isfinite(track.accel_m_s2).all(axis=1)
     if measured.sum() < 10:
         return
-    world_from_imu = Rotation.from_quat(track.orientation_wxyz[measured][:, [1, 2, 3, 0]])
+    world_from_imu = from_wxyz(track.orientation_wxyz[measured])
     force = np.median(world_from_imu.apply(track.accel_m_s2[measured]), axis=0)
     size = float(np.median(np.linalg.norm(track.accel_m_s2[measured], axis=1)))
     if abs(size - 1) < 0.3:

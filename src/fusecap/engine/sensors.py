@@ -16,6 +16,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from fusecap.engine.samples import Samples
+from fusecap.geometry.quaternions import from_wxyz
 from fusecap.sources.session import ImuSettings, SubjectSettings
 from fusecap.sources.synchronizer import (
     EXACT_S,
@@ -151,7 +152,7 @@ class Sensors:
             if len(recent) < TPOSE_SAMPLES:
                 silent.append(self._bones[row])
                 continue
-            turned = Rotation.from_quat(np.array([q for q, _ in recent])[:, [1, 2, 3, 0]])
+            turned = from_wxyz(np.array([q for q, _ in recent]))
             mean = turned.mean()
             away_deg = np.degrees((mean.inv() * turned).magnitude().max())
             if away_deg > TPOSE_MOVED_DEG:
@@ -172,8 +173,7 @@ def _mounting(imu: ImuSettings) -> np.ndarray:
     """R_ib; NaN where it is to be found in a T-pose."""
     if imu.bone_from_imu_wxyz is None:
         return np.full((3, 3), np.nan)
-    w, x, y, z = imu.bone_from_imu_wxyz
-    return Rotation.from_quat([x, y, z, w]).as_matrix()
+    return from_wxyz(imu.bone_from_imu_wxyz).as_matrix()
 
 
 def _around(samples: Samples[Measured], now_ns: int) -> tuple[Measured, Measured, float] | None:

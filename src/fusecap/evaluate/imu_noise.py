@@ -24,6 +24,7 @@ from scipy.spatial.transform import Rotation
 from fusecap.body.pose import forward_kinematics
 from fusecap.body.shape import BodyShape, end_offsets_m
 from fusecap.evaluate.noise import bursts, correlated_noise
+from fusecap.geometry.quaternions import to_wxyz
 from fusecap.sources.imu_files.track import GRAVITY_M_S2, ImuTrack
 from fusecap.sources.synchronizer import MountedImu, resample_imus
 from fusecap.types import ImuReading
@@ -154,8 +155,7 @@ class SimulatedImus:
 
     def orientation_wxyz(self, sensor: int) -> Float[np.ndarray, "t 4"]:
         """imu_world_from_imu of one sensor, w >= 0."""
-        rotation = Rotation.from_matrix(self.world_from_imu[:, sensor])
-        return np.roll(rotation.as_quat(canonical=True), 1, axis=1)
+        return to_wxyz(Rotation.from_matrix(self.world_from_imu[:, sensor]))
 
     def readings(self) -> tuple[ImuReading, ...]:
         """What the solver is given, per frame, as from a session's files [1, eq. 8, 12]."""

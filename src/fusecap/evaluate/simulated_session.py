@@ -20,6 +20,7 @@ from fusecap.errors import InputError
 from fusecap.evaluate.imu_noise import SimulatedImus
 from fusecap.evaluate.simulator import Person, Simulation
 from fusecap.files import safe_name, written_whole
+from fusecap.geometry.quaternions import to_wxyz
 from fusecap.progress import Progress
 from fusecap.sources.calibration_files import aniposelib
 from fusecap.sources.toml_text import quoted
@@ -106,7 +107,7 @@ def _subject_toml(person: Person, bone_lengths: bool) -> str:
 
 
 def _imu_toml(subject: str, imus: SimulatedImus) -> list[str]:
-    quaternion = _wxyz(imus.bone_from_imu)
+    quaternion = to_wxyz(Rotation.from_matrix(imus.bone_from_imu))
     return [
         "[[subject.imu]]\n"
         f"bone = {quoted(bone)}\n"
@@ -144,10 +145,6 @@ def _openpose_json(people: Float[np.ndarray, "n k 3"]) -> str:
             "people": [{"person_id": [-1], "pose_keypoints_2d": row} for row in rows],
         }
     )
-
-
-def _wxyz(rotation: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 4"]:
-    return np.roll(Rotation.from_matrix(rotation).as_quat(canonical=True), 1, axis=1)
 
 
 def _write(path: Path, text: str) -> None:

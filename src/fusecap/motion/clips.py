@@ -21,6 +21,7 @@ from fusecap.body.motion_model import evaluate_series, theta_of_channels
 from fusecap.body.shape import REFERENCE_HEIGHT_M, BodyShape
 from fusecap.body.skeleton import PAPER21
 from fusecap.errors import InputError
+from fusecap.geometry.quaternions import to_wxyz
 from fusecap.motion.files.folder import MotionFolder
 from fusecap.motion.motion import Motion
 from fusecap.motion.retarget import retarget, sole_heights_m
@@ -117,7 +118,7 @@ def _bridged_channels(theta: Float[np.ndarray, "t p"], rate_hz: float) -> Float[
     """Root position and quaternions wxyz whose signs do not jump, mislabelled frames bridged."""
     frames = len(theta)
     rotation = Rotation.from_rotvec(theta[:, 3:].reshape(-1, 3))
-    quaternion = rotation.as_quat()[:, [3, 0, 1, 2]].reshape(frames, -1, 4)
+    quaternion = to_wxyz(rotation).reshape(frames, -1, 4)
     cosine = np.abs(np.sum(quaternion[1:] * quaternion[:-1], axis=-1))
     jump = 2 * np.arccos(np.minimum(cosine, 1.0)) * rate_hz > _MAX_SPEED_RAD_S
     mislabelled = rotation.magnitude().reshape(frames, -1) > np.append(

@@ -10,9 +10,10 @@ import json
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from fusecap.body.shape import BodyShape
-from fusecap.streams.person_pose import xyzw_from_matrix
+from fusecap.geometry.quaternions import to_wxyz
 from fusecap.types import CameraSample, Command, Estimate, ImuSample, Tick
 
 
@@ -41,7 +42,7 @@ def tick_message(tick: Tick) -> str:
 
 
 def pose_message(estimate: Estimate) -> str:
-    xyzw = xyzw_from_matrix(estimate.bone_rotation_in_world)
+    wxyz = to_wxyz(Rotation.from_matrix(estimate.bone_rotation_in_world))
     return (
         f'{{"name":{json.dumps(estimate.name)},"track_id":{estimate.track_id},'
         f'"timestamp_ns":{estimate.timestamp_ns},"status":"{estimate.status.name.lower()}",'
@@ -50,7 +51,7 @@ def pose_message(estimate: Estimate) -> str:
         f'"views":{json.dumps(estimate.views.tolist())},'
         f'"theta":{_numbers(estimate.theta)},"bone_quality":{_numbers(estimate.bone_quality)},'
         f'"position_m":{_numbers(np.round(estimate.bone_position_in_world_m, 6))},'
-        f'"rotation_wxyz":{_numbers(np.round(np.roll(xyzw, 1, axis=1), 7))}}}'
+        f'"rotation_wxyz":{_numbers(np.round(wxyz, 7))}}}'
     )
 
 

@@ -19,6 +19,7 @@ from fusecap.body.landmarks import LandmarkSet, landmark_set_named
 from fusecap.errors import SessionError
 from fusecap.findings import Finding
 from fusecap.geometry.camera import Rig
+from fusecap.geometry.quaternions import from_wxyz
 from fusecap.progress import Progress
 from fusecap.sources.calibration_files import check_rig, load_rig
 from fusecap.sources.detection_files import read_record
@@ -380,8 +381,7 @@ def mount(subject: SubjectSettings, tracks: list[ImuTrack]) -> list[MountedImu]:
 def _bone_from_imu(subject: SubjectSettings, imu: ImuSettings, track: ImuTrack) -> np.ndarray:
     where = f"imu '{imu.bone}' of '{subject.name}'"
     if imu.bone_from_imu_wxyz is not None:
-        w, x, y, z = imu.bone_from_imu_wxyz
-        return Rotation.from_quat([x, y, z, w]).as_matrix()
+        return from_wxyz(imu.bone_from_imu_wxyz).as_matrix()
     if subject.tpose_s is None:
         raise SessionError(
             f"{where}: how it sits on the bone is not known; fusecap calibrate imu finds it from "
@@ -395,7 +395,7 @@ def _bone_from_imu(subject: SubjectSettings, imu: ImuSettings, track: ImuTrack) 
             f"{where}: no sample in tpose_s = [{start_s:g}, {end_s:g}]; its samples run from "
             f"{track.times_s[0]:g} to {track.times_s[-1]:g} s"
         )
-    mean = Rotation.from_quat(track.orientation_wxyz[inside][:, [1, 2, 3, 0]]).mean().as_matrix()
+    mean = from_wxyz(track.orientation_wxyz[inside]).mean().as_matrix()
     world_from_imu = world_from_imu_world(imu.imu_up, imu.heading_deg) @ mean
     world_from_bone = Rotation.from_euler("y", subject.tpose_facing_deg, degrees=True).as_matrix()
     return world_from_bone.T @ world_from_imu

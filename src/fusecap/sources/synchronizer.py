@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fusecap.geometry.camera import Y_UP_FROM_Z_UP
+from fusecap.geometry.quaternions import from_wxyz
 from fusecap.geometry.same_people import same_people
 from fusecap.sources.imu_files.track import GRAVITY_M_S2, ImuTrack
 from fusecap.sources.keypoint_files import KeypointTrack
@@ -157,8 +158,8 @@ def orientations_between(
     first_wxyz: np.ndarray, second_wxyz: np.ndarray, share: np.ndarray
 ) -> np.ndarray:
     """(N, 3, 3): `share` (N,) of the way from the first to the second orientation, by slerp."""
-    first = Rotation.from_quat(first_wxyz[:, [1, 2, 3, 0]])
-    second = Rotation.from_quat(second_wxyz[:, [1, 2, 3, 0]])
+    first = from_wxyz(first_wxyz)
+    second = from_wxyz(second_wxyz)
     turn = (first.inv() * second).as_rotvec()
     return (first * Rotation.from_rotvec(share[:, None] * turn)).as_matrix()
 
@@ -175,7 +176,7 @@ def _resample(track: ImuTrack, times_s: np.ndarray) -> tuple[np.ndarray, np.ndar
     if len(own) == 1:
         valid = np.abs(times_s - own[0]) <= EXACT_S
         count = int(valid.sum())
-        once = Rotation.from_quat(track.orientation_wxyz[:, [1, 2, 3, 0]]).as_matrix()
+        once = from_wxyz(track.orientation_wxyz).as_matrix()
         return np.repeat(once, count, 0), np.repeat(track.accel_m_s2, count, 0), valid
     inside = (times_s >= own[0] - EXACT_S) & (times_s <= own[-1] + EXACT_S)
     clamped = np.clip(times_s, own[0], own[-1])

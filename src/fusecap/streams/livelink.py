@@ -16,14 +16,15 @@ import json
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from fusecap.body.skeleton import EXTENDED23
+from fusecap.geometry.quaternions import to_xyzw
 from fusecap.streams.axes import UNREAL
 from fusecap.streams.person_pose import (
     PersonPose,
     StreamFrame,
     in_parents,
-    xyzw_from_matrix,
 )
 
 DEFAULT_PORT = 54321
@@ -74,7 +75,7 @@ def _bones(pose: PersonPose) -> list[dict[str, Any]]:
         parents, pose.bone_position_in_world_m, pose.bone_rotation_in_world
     )
     locations_cm = np.round(UNREAL.positions(position_m), 3).tolist()
-    quaternions = np.round(xyzw_from_matrix(UNREAL.rotations(rotation)), 6).tolist()
+    quaternions = np.round(to_xyzw(Rotation.from_matrix(UNREAL.rotations(rotation))), 6).tolist()
     return [
         {
             "Name": name,

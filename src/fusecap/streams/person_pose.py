@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from fusecap.body.shape import REFERENCE_HEIGHT_M, BodyShape
 from fusecap.body.skeleton import EXTENDED23, Skeleton
+from fusecap.geometry.quaternions import from_wxyz, to_xyzw
 from fusecap.take import Take
 from fusecap.types import Estimate
 
@@ -53,7 +54,7 @@ class PersonPose:
     @cached_property
     def bone_rotation_in_world_xyzw(self) -> Float[np.ndarray, "b 4"]:
         """Unit quaternions, w >= 0."""
-        return xyzw_from_matrix(self.bone_rotation_in_world)
+        return to_xyzw(Rotation.from_matrix(self.bone_rotation_in_world))
 
     @cached_property
     def extended(self) -> PersonPose:
@@ -105,7 +106,7 @@ def pose_of_take(
         timestamp_ns=int(take.timestamps_ns[frame]),
         shape=shape or take.shape(subject),
         bone_position_in_world_m=take.bone_position_in_world_m[subject, frame],
-        bone_rotation_in_world=Rotation.from_quat(np.roll(quaternion, -1, axis=1)).as_matrix(),
+        bone_rotation_in_world=from_wxyz(quaternion).as_matrix(),
         bone_quality=take.bone_quality[subject, frame],
     )
 
@@ -155,11 +156,6 @@ def in_parents(
     position[child] = np.einsum("nij,nj->ni", to_parent, away)
     rotation[child] = to_parent @ rotation_in_world[child]
     return position, rotation
-
-
-def xyzw_from_matrix(rotation: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 4"]:
-    """Unit quaternions, w >= 0."""
-    return Rotation.from_matrix(rotation).as_quat(canonical=True)
 
 
 def _clavicle_share() -> float:

@@ -26,11 +26,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fusecap.body.skeleton import EXTENDED23
+from fusecap.geometry.quaternions import to_xyzw
 from fusecap.streams.axes import UNITY
 from fusecap.streams.person_pose import (
     PersonPose,
     StreamFrame,
-    xyzw_from_matrix,
 )
 
 DEFAULT_PORT = 14043
@@ -96,7 +96,7 @@ def rokoko_datagrams(frame: StreamFrame, rate_hz: float) -> list[bytes]:
 def _actor(pose: PersonPose, colour: tuple[int, int, int]) -> dict[str, Any]:
     rotation = UNITY.rotations(pose.bone_rotation_in_world[_BONES]) @ _REFERENCE
     positions = np.round(UNITY.positions(pose.bone_position_in_world_m[_BONES]), 5).tolist()
-    quaternions = np.round(xyzw_from_matrix(rotation), 6).tolist()
+    quaternions = np.round(to_xyzw(Rotation.from_matrix(rotation)), 6).tolist()
     return {
         "name": pose.name,
         "color": colour,

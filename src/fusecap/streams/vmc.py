@@ -13,13 +13,15 @@ and spine2 do together and everything above keeps its place in the world.
 
 from __future__ import annotations
 
+from scipy.spatial.transform import Rotation
+
 from fusecap.body.skeleton import EXTENDED23
+from fusecap.geometry.quaternions import to_xyzw
 from fusecap.streams.axes import UNITY
 from fusecap.streams.osc_packets import bundles, message
 from fusecap.streams.person_pose import (
     PersonPose,
     in_parents,
-    xyzw_from_matrix,
 )
 
 DEFAULT_PORT = 39539
@@ -70,7 +72,7 @@ def _bones(pose: PersonPose) -> list[bytes]:
         _PARENTS, pose.bone_position_in_world_m[_BONES], pose.bone_rotation_in_world[_BONES]
     )
     positions = UNITY.positions(position_m).tolist()
-    quaternions = xyzw_from_matrix(UNITY.rotations(rotation)).tolist()
+    quaternions = to_xyzw(Rotation.from_matrix(UNITY.rotations(rotation))).tolist()
     return [
         message("/VMC/Ext/Bone/Pos", name, *xyz, *xyzw)
         for name, xyz, xyzw in zip(_NAMES, positions, quaternions, strict=True)

@@ -23,8 +23,10 @@ import struct
 from collections.abc import Iterable
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from fusecap.body.shape import BodyShape
+from fusecap.geometry.quaternions import to_wxyz
 from fusecap.streams.person_pose import StreamFrame
 
 DEFAULT_PORT = 8765
@@ -67,7 +69,7 @@ def frame_text(frame: StreamFrame) -> str:
         pose.name: {
             "position_m": np.round(pose.bone_position_in_world_m, 5).tolist(),
             "rotation_wxyz": np.round(
-                np.roll(pose.bone_rotation_in_world_xyzw, 1, axis=1), 6
+                to_wxyz(Rotation.from_matrix(pose.bone_rotation_in_world)), 6
             ).tolist(),
             "quality": np.round(pose.bone_quality, 3).tolist(),
         }
@@ -92,7 +94,7 @@ def frame_bytes(frame: StreamFrame) -> bytes:
         values = np.concatenate(
             [
                 pose.bone_position_in_world_m,
-                np.roll(pose.bone_rotation_in_world_xyzw, 1, axis=1),
+                to_wxyz(Rotation.from_matrix(pose.bone_rotation_in_world)),
                 pose.bone_quality[:, None],
             ],
             axis=1,

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from fusecap.body.shape import REFERENCE_HEIGHT_M, BodyShape, end_offsets_m
 from fusecap.body.skeleton import Skeleton
+from fusecap.geometry.quaternions import to_wxyz
 from fusecap.types import Estimate
 from fusecap.viewer.palette import PALE_RGB, Rgb
 
@@ -145,7 +146,7 @@ class Figure:
         head_m, head_rotation = pose.position_m[self._head], pose.rotation[self._head]
         face_m = head_m + size * np.array([_HEAD_CENTRE_M, _NOSE_M]) @ head_rotation.T
         wxyz = np.tile([1.0, 0.0, 0.0, 0.0], (self.ball_count, 1))
-        wxyz[-2] = Rotation.from_matrix(head_rotation).as_quat(scalar_first=True)
+        wxyz[-2] = to_wxyz(Rotation.from_matrix(head_rotation))
         return Parts(
             position_m=np.concatenate([pose.position_m, self._ends_m(pose), face_m]),
             wxyz=wxyz,

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from fusecap.geometry.camera import Camera, Rig
+from fusecap.geometry.quaternions import to_wxyz
 from fusecap.viewer.palette import CAMERA_RGB
 
 _DIRECTIONS: dict[str, tuple[float, float, float]] = {
@@ -131,7 +132,7 @@ def _frustum(page: viser.ViserServer, camera: Camera, size_m: float) -> viser.Ca
         scale=size_m,
         thickness=0.008,
         color=CAMERA_RGB,
-        wxyz=Rotation.from_matrix(camera.rotation.T).as_quat(scalar_first=True),
+        wxyz=to_wxyz(Rotation.from_matrix(camera.rotation.T)),
         position=camera.position_in_world,
         cast_shadow=False,
         receive_shadow=False,

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from fusecap.errors import InputError, nearest
 from fusecap.geometry.camera import Y_UP_FROM_Z_UP
+from fusecap.geometry.quaternions import from_wxyz
 from fusecap.sources.imu_files.track import GRAVITY_M_S2, ImuTrack
 
 AT_REST_M_S2 = 0.15
@@ -66,7 +66,7 @@ def resting_imu(track: ImuTrack, *, axes: str, imu_up: str = "z") -> RestingImu:
             f"the sensor's mean acceleration is {size:.2f} m/s2, expected {GRAVITY_M_S2:.2f}: "
             "gravity must not be removed, and the unit be m/s2"
         )
-    imu = Rotation.from_quat(track.orientation_wxyz[:, [1, 2, 3, 0]]).mean()
+    imu = from_wxyz(track.orientation_wxyz).mean()
     y_up = Y_UP_FROM_Z_UP if imu_up == "z" else np.eye(3)
     reference_from_imu = y_up @ imu.as_matrix()
     told = reference_from_imu @ (mean / size)

@@ -13,6 +13,7 @@ from fusecap.calibrate.imus.reference import ReferenceMotion
 from fusecap.calibrate.imus.speeds import lag_s
 from fusecap.calibrate.imus.tpose import TPose
 from fusecap.errors import InputError
+from fusecap.geometry.quaternions import from_wxyz
 from fusecap.sources.imu_files.track import ImuTrack
 from fusecap.sources.session import ImuSettings
 from fusecap.sources.synchronizer import MountedImu, resample_imus, world_from_imu_world
@@ -89,8 +90,7 @@ def _wrong_up(worn: Worn) -> str:
     known = np.isfinite(accel).all(axis=1)
     if known.sum() < 10:
         return ""
-    quaternion = worn.track.orientation_wxyz[known][:, [1, 2, 3, 0]]
-    force = Rotation.from_quat(quaternion).apply(accel[known]).mean(axis=0)
+    force = from_wxyz(worn.track.orientation_wxyz[known]).apply(accel[known]).mean(axis=0)
     axis = int(np.argmax(np.abs(force)))
     found = f"{'-' if force[axis] < 0 else ''}{'xyz'[axis]}"
     if np.linalg.norm(force) < 5.0 or found == worn.settings.imu_up:

@@ -16,6 +16,7 @@ from fusecap.calibrate.imus.fit import Fit, HeadingPrior, Pairs, fit, residual_r
 from fusecap.calibrate.imus.identify import Identity
 from fusecap.calibrate.imus.reference import ReferenceMotion
 from fusecap.calibrate.verdict import Verdict
+from fusecap.geometry.quaternions import from_wxyz, to_wxyz
 
 FOLDS = 4
 DRIFT_RAD_S = np.radians(3.0) / 60.0
@@ -95,14 +96,14 @@ def sensor_calibration(
     recorded = pairs.block >= 0
     sigma = np.degrees(fitted.sigma_rad(pairs))
     held_out = float(np.nanmedian(residual_deg))
-    xyzw = Rotation.from_matrix(fitted.bone_from_imu).as_quat(canonical=True)
+    w, x, y, z = to_wxyz(Rotation.from_matrix(fitted.bone_from_imu)).tolist()
     fault, remedy = _fault(worn, identity, change, held_out, sigma)
     step_s = float(np.median(np.diff(reference.times_s)))
     sensor = SensorCalibration(
         subject=reference.subject,
         bone=worn.settings.bone,
         file=worn.settings.source_name,
-        bone_from_imu_wxyz=(float(xyzw[3]), float(xyzw[0]), float(xyzw[1]), float(xyzw[2])),
+        bone_from_imu_wxyz=(w, x, y, z),
         heading_deg=float(np.degrees(fitted.heading_rad)),
         drift_deg_min=float(np.degrees(drifting.drift_rad_s) * 60),
         drift_sigma_deg_min=float(np.degrees(np.sqrt(drifting.covariance[4, 4])) * 60),
@@ -143,9 +144,8 @@ def _stated_deg(worn: Worn, pairs: Pairs) -> float | None:
     stated = worn.settings.bone_from_imu_wxyz
     if stated is None:
         return None
-    w, x, y, z = stated
     given = Fit(
-        bone_from_imu=Rotation.from_quat([x, y, z, w]).as_matrix(),
+        bone_from_imu=from_wxyz(stated).as_matrix(),
         heading_rad=float(np.radians(worn.settings.heading_deg)),
         drift_rad_s=0.0,
         middle_s=0.0,

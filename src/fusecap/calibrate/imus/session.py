@@ -21,6 +21,7 @@ from fusecap.calibrate.imus.motion import (
 from fusecap.calibrate.imus.reference import ReferenceMotion, reference_motion
 from fusecap.calibrate.imus.tpose import TPose, look_at_tpose
 from fusecap.errors import InputError
+from fusecap.geometry.quaternions import to_wxyz
 from fusecap.progress import Progress
 from fusecap.sources.imu_calibration_files import CalibratedImu
 from fusecap.sources.imu_files.track import ImuTrack
@@ -174,11 +175,11 @@ def calibrate_from_tpose(session: Session) -> list[tuple[CalibratedImu, TPose]]:
         _one_per_bone(subject)
         for settings, track in _on_session_clock(session, subject):
             pose = look_at_tpose(subject, settings, track)
-            xyzw = Rotation.from_matrix(pose.bone_from_imu).as_quat(canonical=True)
+            w, x, y, z = to_wxyz(Rotation.from_matrix(pose.bone_from_imu)).tolist()
             imu = CalibratedImu(
                 subject=subject.name,
                 bone=settings.bone,
-                bone_from_imu_wxyz=_wxyz(xyzw),
+                bone_from_imu_wxyz=(w, x, y, z),
                 heading_deg=settings.heading_deg,
             )
             found.append((imu, pose))
@@ -198,7 +199,3 @@ def calibrated_imus(found: Sequence[SubjectCalibration]) -> list[CalibratedImu]:
         for sensor in subject.sensors
         if sensor.usable
     ]
-
-
-def _wxyz(xyzw: np.ndarray) -> tuple[float, float, float, float]:
-    return float(xyzw[3]), float(xyzw[0]), float(xyzw[1]), float(xyzw[2])

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation, Slerp
 
 from fusecap.calibrate.imus.reference import ReferenceMotion
+from fusecap.geometry.quaternions import from_wxyz
 from fusecap.sources.imu_files.track import ImuTrack
 
 SPAN_S = 0.15
@@ -68,8 +69,7 @@ def lag_s(
     )
     for bone, track in zip(bones, tracks, strict=True):
         seen = angular_speed(reference.times_s, reference.rotation_in_world[:, bone], grid)
-        quaternion = track.orientation_wxyz[:, [1, 2, 3, 0]]
-        worn = angular_speed(track.times_s, Rotation.from_quat(quaternion).as_matrix(), around)
+        worn = angular_speed(track.times_s, from_wxyz(track.orientation_wxyz).as_matrix(), around)
         if np.isfinite(seen).sum() < MIN_OVERLAP_S * LAG_RATE_HZ:
             continue
         total += _correlations(seen, worn, len(steps))

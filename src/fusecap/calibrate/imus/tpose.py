@@ -15,6 +15,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from fusecap.errors import SessionError
+from fusecap.geometry.quaternions import from_wxyz
 from fusecap.sources.imu_files.track import ImuTrack
 from fusecap.sources.session import ImuSettings, SubjectSettings
 from fusecap.sources.synchronizer import world_from_imu_world
@@ -69,13 +70,13 @@ def look_at_tpose(subject: SubjectSettings, imu: ImuSettings, track: ImuTrack) -
             f"{track.times_s[0]:g} to {track.times_s[-1]:g} s"
         )
     upright = world_from_imu_world(imu.imu_up, 0.0)
-    turned = Rotation.from_quat(track.orientation_wxyz[inside][:, [1, 2, 3, 0]])
+    turned = from_wxyz(track.orientation_wxyz[inside])
     mean = turned.mean()
     accel = track.accel_m_s2[inside]
     known = np.isfinite(accel).all(axis=1)
     gravity_deg = float("nan")
     if known.any():
-        force = upright @ Rotation.from_quat(turned.as_quat()[known]).apply(accel[known]).mean(
+        force = upright @ from_wxyz(track.orientation_wxyz[inside][known]).apply(accel[known]).mean(
             axis=0
         )
         gravity_deg = float(np.degrees(np.arccos(force[1] / np.linalg.norm(force))))

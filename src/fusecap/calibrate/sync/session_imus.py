@@ -11,7 +11,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-from scipy.spatial.transform import Rotation
 
 from fusecap.calibrate.sync.clock_rows import (
     SIGNIFICANT,
@@ -26,6 +25,7 @@ from fusecap.calibrate.sync.imus import Comparison, Filmed, ImuClock, Worn, unkn
 from fusecap.calibrate.sync.signals import MAX_GAP_S
 from fusecap.calibrate.sync.stamp import ERROR_S, Stamp, find_stamp
 from fusecap.calibrate.verdict import Verdict
+from fusecap.geometry.quaternions import from_wxyz
 from fusecap.progress import Progress
 from fusecap.sources.imu_files import ImuTrack
 from fusecap.sources.session import Session, SubjectSettings
@@ -175,7 +175,7 @@ def _worn(bone: str, track: ImuTrack) -> Worn:
     return Worn(
         bone=bone,
         times_s=track.times_s,
-        rotation=Rotation.from_quat(track.orientation_wxyz[:, [1, 2, 3, 0]]).as_matrix(),
+        rotation=from_wxyz(track.orientation_wxyz).as_matrix(),
     )
 
 

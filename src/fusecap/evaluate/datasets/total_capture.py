@@ -40,6 +40,7 @@ from fusecap.errors import InputError
 from fusecap.evaluate.datasets.files import floats, read_text
 from fusecap.evaluate.datasets.recording import BoneTruth, Recording, last_frame, read_views
 from fusecap.geometry.camera import Camera, Rig
+from fusecap.geometry.quaternions import from_wxyz
 from fusecap.solve.estimator import SubjectModel
 from fusecap.solve.pose_solver import ImuSites
 from fusecap.sources.calibration_files import fields
@@ -385,8 +386,7 @@ def _read_imus(sequence: Sequence, facing: Float[np.ndarray, "3 3"]) -> list[Imu
     reference = read_imu_calibration(sequence.imu_ref)
     bone = read_imu_calibration(sequence.imu_bone)
     frames, sensors = wxyz.shape[:2]
-    xyzw = np.roll(wxyz.reshape(-1, 4), -1, axis=1)
-    world_from_imu = Rotation.from_quat(xyzw).as_matrix().reshape(frames, sensors, 3, 3)
+    world_from_imu = from_wxyz(wxyz.reshape(-1, 4)).as_matrix().reshape(frames, sensors, 3, 3)
     world_from_imu = reference @ world_from_imu
     rotation = world_from_imu @ np.swapaxes(bone, 1, 2) @ facing
     accel = np.einsum("tiab,tib->tia", world_from_imu, force) - [0.0, GRAVITY_M_S2, 0.0]

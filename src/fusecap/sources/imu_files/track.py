@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from fusecap.errors import InputError
+from fusecap.geometry.quaternions import from_wxyz
 
 GRAVITY_M_S2 = 9.80665
 _UNIT_TOLERANCE = 0.01
@@ -109,7 +109,7 @@ def specific_force(
     norm = np.linalg.norm(orientation_wxyz, axis=1)
     usable = np.isfinite(norm) & (norm > 0.1)
     if usable.any():
-        imu_world_from_imu = Rotation.from_quat(orientation_wxyz[usable][:, [1, 2, 3, 0]])
+        imu_world_from_imu = from_wxyz(orientation_wxyz[usable])
         with_gravity = free_accel_in_imu_world_m_s2[usable] + [0.0, 0.0, GRAVITY_M_S2]
         result[usable] = imu_world_from_imu.inv().apply(with_gravity)
     return result

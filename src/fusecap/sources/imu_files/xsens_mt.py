@@ -17,6 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fusecap.errors import InputError
+from fusecap.geometry.quaternions import to_wxyz
 from fusecap.sources.imu_files.table import Table, read_table
 from fusecap.sources.imu_files.track import ImuTrack, SharedClock, tidy, unwrapped
 
@@ -80,5 +81,5 @@ def _orientation_wxyz(table: Table) -> np.ndarray:
         )
     result = np.full((len(numbers), 4), np.nan)
     if rotation is not None:
-        result[usable] = rotation.as_quat()[:, [3, 0, 1, 2]]
+        result[usable] = to_wxyz(rotation)
     return result
