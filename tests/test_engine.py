@@ -237,6 +237,13 @@ def test_subject_is_found_anew_where_it_stands(scene):
     assert before["anna"] != after["anna"] and before["ben"] == after["ben"]
 
 
+def test_who_is_not_measured_for_a_second_is_said_to_be_lost(scene):
+    phases = [Phase(0.0, ALL, True, ""), Phase(0.5, (), False, "")]
+    for seconds, lost in ((1.4, 0), (1.8, 2)):
+        _, notes = run(scene, phases, seconds=seconds)
+        assert sum("lost: no camera sees them" in note for note in notes) == lost
+
+
 def test_commands_that_cannot_be_obeyed_are_noted(scene):
     _, setup, _ = scene
     engine = Engine(setup)

@@ -154,6 +154,17 @@ def test_change_of_footing_is_blended_from_the_motion_it_had():
     assert x_m[-1] == script[-1][0].theta[0]
 
 
+def test_a_bone_that_turns_goes_on_turning_when_the_footing_changes():
+    def turned(k):
+        return estimate(k, at(0.0, 0.03 * k + (0.4 if k >= 20 else 0.0)))
+
+    script = [(turned(k), BOTH if k >= 20 else (1, False)) for k in range(60)]
+    bone = 3 + 3 * PAPER21.bone("left_upper_arm") + 2
+    arm_rad = np.array([e.theta[bone] for e in sent(script)])
+    assert arm_rad[20] == pytest.approx(0.6, abs=1e-6)
+    assert np.diff(arm_rad).min() > 0.029, "never slower than it turned"
+
+
 def test_who_is_not_measured_is_held_and_fades():
     out = sent([estimate(0, at(1.0)), *[None] * 200], hold_s=3.0)
     quality = [0.0 if e is None else float(e.bone_quality[0]) for e in out]

@@ -180,6 +180,8 @@ def test_sensor_says_nothing_before_its_mounting_is_known():
     assert sensors.readings(500 * MS) == {}
     assert "taken by 1 sensors" in sensors.mount_in_tpose("anna", 0.5)
     assert heading_rad(sensors.readings(500 * MS)["anna"]) == pytest.approx(0.5)
+    turned = Rotation.from_matrix(sensors.mountings["anna", "head"]).as_rotvec()
+    assert turned == pytest.approx([0.0, 0.2, 0.0]), "0.7 rad in the world, of which she faces 0.5"
 
 
 def test_tpose_of_a_sensor_that_moved_is_refused():
@@ -189,6 +191,14 @@ def test_tpose_of_a_sensor_that_moved_is_refused():
     said = sensors.mount_in_tpose("anna", 0.0)
     assert "refused" in said and "head by" in said and "stand still" in said
     assert sensors.readings(500 * MS) == {}
+
+
+@pytest.mark.parametrize(("still_ms", "found"), [(1010, "taken"), (990, "refused")])
+def test_tpose_needs_a_second_of_standing_still(still_ms, found):
+    sensors = worn()
+    for t_ms in range(0, 1910, 10):
+        sensors.take(sample(t_ms, 0.0 if t_ms > 1900 - still_ms else 1.0))
+    assert found in sensors.mount_in_tpose("anna", 0.0)
 
 
 def test_tpose_of_silent_sensors_is_refused():
