@@ -23,9 +23,8 @@ from fusecap.evaluate.demo_scene import demo_scene
 from fusecap.evaluate.simulated_session import write_session
 from fusecap.evaluate.simulator import CameraTiming, Simulation, simulate
 from fusecap.live.devices.source import Deliver, Delivery, Source, SourceCounts
-from fusecap.live.outputs import first_cast
 from fusecap.live.run import LiveRun
-from fusecap.live.stream_process import StreamProcess
+from fusecap.live.streaming import Streaming
 from fusecap.streams.target import Target
 from fusecap.types import CameraImage, CameraSample
 
@@ -237,6 +236,4 @@ def reading_client(url: str) -> Iterator[None]:
 
 def send_to(run: LiveRun, targets: Sequence[Target]) -> None:
     """Streams of a run, in a process of their own."""
-    streams = StreamProcess(targets, first_cast(run.setup), run.rate_hz, run.clock, run.latency)
-    for listener in (streams, *streams.outputs):
-        run.add_listener(listener)
+    run.add_listener(Streaming(targets, run.setup, run.rate_hz, run.clock, run.latency))

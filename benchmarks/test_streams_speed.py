@@ -12,17 +12,17 @@ import time
 import pytest
 
 from fusecap.evaluate.demo_scene import demo_scene
-from fusecap.streams.livelink import livelink_datagrams
-from fusecap.streams.lsl import lsl_sample
-from fusecap.streams.osc import osc_datagrams
 from fusecap.streams.person_pose import StreamFrame, pose_of_take
 from fusecap.streams.play_take import TakePlayer
-from fusecap.streams.rokoko import rokoko_datagrams
-from fusecap.streams.streams import open_stream
+from fusecap.streams.protocols.livelink import livelink_datagrams
+from fusecap.streams.protocols.lsl import lsl_sample
+from fusecap.streams.protocols.osc import osc_datagrams
+from fusecap.streams.protocols.rokoko import rokoko_datagrams
+from fusecap.streams.protocols.vmc import vmc_datagrams
+from fusecap.streams.protocols.ws import frame_bytes, frame_text
+from fusecap.streams.stream import open_stream
 from fusecap.streams.target import parse_target
 from fusecap.streams.transports import Counts, UdpSender
-from fusecap.streams.vmc import vmc_datagrams
-from fusecap.streams.websocket import frame_bytes, frame_text
 
 ENCODERS = {
     "vmc": lambda frame: [vmc_datagrams(pose, 0.0) for pose in frame.tracked],

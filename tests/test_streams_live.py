@@ -23,7 +23,8 @@ from websockets.sync.client import connect
 
 from fusecap.errors import InputError, TakeError
 from fusecap.streams.play_take import TakePlayer, play
-from fusecap.streams.streams import WebSocketStream, open_stream
+from fusecap.streams.protocols.ws import WebSocketStream
+from fusecap.streams.stream import open_stream
 from fusecap.streams.target import Target, parse_target
 from fusecap.streams.transports import CLIENT_QUEUE, Counts, UdpSender, WebSocketServer
 from fusecap.take import save_take
@@ -441,7 +442,7 @@ import sys
 sys.path[:0] = {paths}
 import numpy as np, pylsl, test_streams_live as t
 from fusecap.streams.play_take import TakePlayer
-from fusecap.streams.streams import open_stream
+from fusecap.streams.stream import open_stream
 from fusecap.streams.target import parse_target
 from motions import person, take_of, walk
 take = take_of(walk(person(), 25)[None], [person()], names=("anna",), rate_hz=50.0)

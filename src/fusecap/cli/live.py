@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from fusecap.live.devices.playback_sources import PlaybackOptions, Stall
     from fusecap.live.record_switch import RecordSwitch
     from fusecap.live.run import LiveRun
-    from fusecap.live.stream_process import RemoteOutput
+    from fusecap.live.streaming import Streaming
     from fusecap.sources.session import Session
     from fusecap.streams.target import Target
     from fusecap.viewer.live import LiveViewer
@@ -132,7 +132,7 @@ def live(
     options = LiveOptions(delay_s=None if delay_ms is None else 1e-3 * delay_ms)
     run = LiveRun(setup, sources, detector, options, clock=clock)
     try:
-        outputs = _add_outputs(run, targets)
+        streaming = _add_streams(run, targets)
         switch = RecordSwitch(run, partial(recording_path, loaded), images=record_images)
         path = None if no_record else switch.begin(record)
         page = _add_viewer(run, switch, host, view_port) if view else None
@@ -140,7 +140,7 @@ def live(
         run.close()
         raise
     if not as_json:
-        _announce(run, outputs, path, page.address if page else None, missing)
+        _announce(run, streaming, path, page.address if page else None, missing)
     for target in targets:
         warn_if_open(target)
     if page is not None and page.note:
@@ -196,16 +196,14 @@ def _stall(text: str) -> Stall:
     return Stall(source=source, start_s=start_s, length_s=length_s)
 
 
-def _add_outputs(run: LiveRun, targets: Sequence[Target]) -> tuple[RemoteOutput, ...]:
+def _add_streams(run: LiveRun, targets: Sequence[Target]) -> Streaming | None:
     if not targets:
-        return ()
-    from fusecap.live.outputs import first_cast
-    from fusecap.live.stream_process import StreamProcess
+        return None
+    from fusecap.live.streaming import Streaming
 
-    streams = StreamProcess(targets, first_cast(run.setup), run.rate_hz, run.clock, run.latency)
-    for listener in (streams, *streams.outputs):
-        run.add_listener(listener)
-    return streams.outputs
+    streaming = Streaming(targets, run.setup, run.rate_hz, run.clock, run.latency)
+    run.add_listener(streaming)
+    return streaming
 
 
 def recording_path(session: Session) -> Path:
@@ -228,7 +226,7 @@ def _add_viewer(
 
 def _announce(
     run: LiveRun,
-    outputs: Sequence[RemoteOutput],
+    streaming: Streaming | None,
     path: Path | None,
     page: str | None,
     missing: Sequence[str],
@@ -241,8 +239,7 @@ def _announce(
         f"with {sensors} sensors; {run.rate_hz:g} instants/s, each solved "
         f"{1e3 * run.delay_s:.0f} ms after exposure{pace}; Ctrl-C ends it"
     ]
-    for output in outputs:
-        where = output.where() or {"everyone": output.stream_status().to}
+    for where in streaming.addresses if streaming else ():
         lines += [f"  {name} -> {address}" for name, address in where.items()]
     if path is not None:
         lines.append(f"  recording -> {path}")

@@ -15,7 +15,7 @@ from fusecap.cli.targets import TO_HELP, placed_targets, warn_if_open
 
 if TYPE_CHECKING:
     from fusecap.streams.play_take import PlaybackState, TakePlayer
-    from fusecap.streams.streams import Stream
+    from fusecap.streams.stream import Stream
 
 EXAMPLE = "Example: fusecap stream demo/demo.npz --to vmc://127.0.0.1:39539 --to ws --loop"
 
@@ -51,7 +51,7 @@ def stream(
     Receivers, ports and axes are in docs/streams.md. Ctrl-C ends it.
     """
     from fusecap.streams.play_take import TakePlayer, play
-    from fusecap.streams.streams import open_stream
+    from fusecap.streams.stream import open_stream
     from fusecap.take import load_take
 
     targets = placed_targets(to, host)

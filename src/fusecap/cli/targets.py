@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING
 
 from fusecap.cli.common import err
 from fusecap.errors import InputError
+from fusecap.streams.protocols import NAMES
 
 if TYPE_CHECKING:
     from fusecap.streams.target import Target
 
 TO_HELP = (
-    "Where to: vmc, livelink, rokoko, osc, each with ://HOST:PORT unless the usual port of this "
-    "machine will do; ws (serves WebSocket clients); lsl. Repeatable."
+    f"Where to: {', '.join(NAMES)}, each with ://HOST:PORT where the usual port of this machine "
+    "will not do. docs/streams.md says who understands which. Repeatable."
 )
 
 
@@ -25,17 +26,17 @@ def placed_targets(
 
     `other_servers` says that the command serves something else there as well. Raises `InputError`.
     """
-    from fusecap.streams.target import is_loopback, parse_target
+    from fusecap.streams.target import is_loopback, parse_target, serves
 
     targets = [parse_target(text) for text in to]
-    if host is not None and not other_servers and all(t.protocol != "ws" for t in targets):
+    if host is not None and not other_servers and not any(map(serves, targets)):
         raise InputError("--host is the address on which ws serves clients; add --to ws")
     placed = [
-        replace(target, host=host) if target.protocol == "ws" and host is not None else target
+        replace(target, host=host) if host is not None and serves(target) else target
         for target in targets
     ]
     for target in placed:
-        if target.protocol == "ws" and host is None and not is_loopback(target.host):
+        if host is None and serves(target) and not is_loopback(target.host):
             raise InputError(
                 f"--to {target}: this would let other machines connect; "
                 f"if that is meant, add --host {target.host}"
@@ -50,9 +51,9 @@ def placed_targets(
 
 def warn_if_open(target: Target) -> None:
     """Say so where other machines can connect."""
-    from fusecap.streams.target import is_loopback
+    from fusecap.streams.target import is_loopback, serves
 
-    if target.protocol == "ws" and not is_loopback(target.host):
+    if serves(target) and not is_loopback(target.host):
         err.print(
             f"[yellow]note[/] {target} is open: whoever reaches this machine on port "
             f"{target.port} can follow the motion; there is no password and no encryption",

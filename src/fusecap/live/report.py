@@ -15,8 +15,8 @@ from fusecap.live.status import (
     RecordingStatus,
     SourceStatus,
     StageLatency,
-    StreamStatus,
 )
+from fusecap.streams.output import StreamStatus
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

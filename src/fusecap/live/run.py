@@ -32,8 +32,9 @@ from fusecap.live.incidents import Incidents
 from fusecap.live.latency import CAMERA, SENSOR, LatencyBook
 from fusecap.live.report import LiveReport, subject_reports
 from fusecap.live.solving import LiveEngine, Solving
-from fusecap.live.status import LiveStatus, RecordingStatus, SourceStatus, StreamStatus
+from fusecap.live.status import LiveStatus, RecordingStatus, SourceStatus
 from fusecap.setup import SessionSetup
+from fusecap.streams.output import StreamStatus
 from fusecap.types import CameraImage, CameraSample, Command, Event
 
 DELAY_WITH_DETECTOR_S = 0.2
@@ -82,18 +83,13 @@ class Listener(Protocol):
 class Sending(Protocol):
     """A listener that sends poses on."""
 
-    def stream_status(self) -> StreamStatus:
-        """How it goes."""
+    def stream_statuses(self) -> Sequence[StreamStatus]:
+        """How each of its streams goes."""
         ...
 
     @property
-    def poses(self) -> int:
+    def poses(self) -> float:
         """Instants sent so far."""
-        ...
-
-    @property
-    def poses_per_s(self) -> float:
-        """Instants sent, over the last seconds."""
         ...
 
 
@@ -156,6 +152,7 @@ class LiveRun:
         self._refused: set[str] = set()
         self._feed_of: dict[Key, Feed] = {}
         self._lateness: deque[tuple[int, int]] = deque([(0, 0)], maxlen=_ROLL_S + 1)
+        self._sent: deque[tuple[int, float]] = deque(maxlen=_ROLL_S)
         self._seconds = 0
         self._begun_ns = self._end_ns = self.clock.now_ns()
         self._ended_ns: int | None = None
@@ -356,16 +353,18 @@ class LiveRun:
         )
         (late_before, before), (late, instants) = self._lateness[0], self._lateness[-1]
         senders = [one for one in self._listeners if isinstance(one, Sending)]
+        self._sent.append((now_ns, _mean([sender.poses for sender in senders])))
+        (sent_before_ns, sent_before), (_, sent) = self._sent[0], self._sent[-1]
         recordings = [status for one in self._listeners if (status := _recording(one))]
         return LiveStatus(
             elapsed_s=1e-9 * (now_ns - self._begun_ns),
             detections_per_s=self._detections_per_s(now_ns),
             solves_per_s=solving.solves.rate_hz(now_ns),
-            packets_per_s=_mean([sender.poses_per_s for sender in senders]),
+            packets_per_s=1e9 * (sent - sent_before) / max(now_ns - sent_before_ns, 1),
             late_share=(late - late_before) / max(instants - before, 1),
             sources=self._sources(now_ns),
             latency=self.latency.window(),
-            streams=tuple(sender.stream_status() for sender in senders),
+            streams=tuple(one for sender in senders for one in sender.stream_statuses()),
             recording=recordings[-1] if recordings else None,
             incidents=self.incidents.all()[-_SHOWN:],
             cpu_share=self._load.recent_cpu_share(),
@@ -417,7 +416,7 @@ class LiveRun:
             subjects=subject_reports(solving.people, instants),
             inputs=self._sources(self._end_ns),
             sources=tuple(feed.report() for feed in self._feeds),
-            streams=tuple(sender.stream_status() for sender in senders),
+            streams=tuple(one for sender in senders for one in sender.stream_statuses()),
             recordings=tuple(self._recordings),
             incidents=self.incidents.all(),
             incident_count=self.incidents.count,

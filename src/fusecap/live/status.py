@@ -5,6 +5,8 @@ from __future__ import annotations
 import enum
 from dataclasses import dataclass
 
+from fusecap.streams.output import StreamStatus
+
 
 class Light(enum.Enum):
     """Of a source."""
@@ -46,18 +48,6 @@ class StageLatency:
     p95_ms: float
     p99_ms: float
     count: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StreamStatus:
-    """One receiver."""
-
-    to: str
-    sent: int
-    dropped: int
-    refused: int
-    failed: int
-    remark: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

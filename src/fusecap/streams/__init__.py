@@ -1,5 +1,6 @@
-"""Solved people as packets of other programs' protocols: no sockets, no clocks.
+"""Solved people, sent live as other programs' packets.
 
-One protocol per file. Each takes a `StreamFrame` and gives the bytes or numbers that the receiver
-expects, in the receiver's axes and under its bone names; docs/streams.md lists them all.
+`person_pose.py` is what goes in. `protocols/` has one module per protocol and their table,
+`transports.py` what carries packets; `stream.py` joins them, `target.py` says where to. A take is
+played by `play_take.py`, a live run sends through `process.py`. docs/streams.md is the manual.
 """

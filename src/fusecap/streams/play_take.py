@@ -19,7 +19,7 @@ import numpy as np
 from fusecap.body.shape import BodyShape
 from fusecap.errors import InputError, TakeError
 from fusecap.streams.person_pose import StreamFrame, pose_of_take
-from fusecap.streams.streams import Stream
+from fusecap.streams.stream import Stream
 from fusecap.take import Take
 
 MIN_SPEED, MAX_SPEED = 0.01, 100.0

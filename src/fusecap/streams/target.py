@@ -7,68 +7,61 @@ from dataclasses import dataclass
 from urllib.parse import urlsplit
 
 from fusecap.errors import InputError, nearest
-from fusecap.streams import livelink, osc, rokoko, vmc, websocket
+from fusecap.streams.protocols import NAMES, protocol_named
 
-DEFAULT_PORTS = {
-    "vmc": vmc.DEFAULT_PORT,
-    "livelink": livelink.DEFAULT_PORT,
-    "rokoko": rokoko.DEFAULT_PORT,
-    "osc": osc.DEFAULT_PORT,
-    "ws": websocket.DEFAULT_PORT,
-}
-PROTOCOLS = (*DEFAULT_PORTS, "lsl")
 LOOPBACK = "127.0.0.1"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Target:
-    """A protocol and where it is sent to; for `ws` where clients are served."""
+    """A protocol and where it is sent to, or where clients are served; no host: found by itself."""
 
     protocol: str
     host: str = ""
     port: int = 0
 
     def __str__(self) -> str:
-        if self.protocol == "lsl":
-            return "lsl"
+        if not self.host:
+            return self.protocol
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{self.protocol}://{host}:{self.port}"
 
 
 def parse_target(text: str) -> Target:
     """Host and port may be left out; raises `InputError` that says what is wrong with `text`."""
-    protocol, separator, rest = text.partition("://")
-    if protocol not in PROTOCOLS:
+    name, separator, rest = text.partition("://")
+    if name not in NAMES:
         raise InputError(
-            f"--to {text}: no protocol '{protocol}', expected something like "
-            f"vmc://{LOOPBACK}:{vmc.DEFAULT_PORT}{nearest(protocol, PROTOCOLS)}"
+            f"--to {text}: no protocol '{name}', expected one of {', '.join(NAMES)}, as in "
+            f"{NAMES[0]}://{LOOPBACK}:{protocol_named(NAMES[0]).port}{nearest(name, NAMES)}"
         )
-    if protocol == "lsl":
+    usual_port = protocol_named(name).port
+    if usual_port is None:
         if rest:
-            raise InputError(f"--to {text}: lsl finds its receivers by itself; write --to lsl")
-        return Target(protocol="lsl")
+            raise InputError(
+                f"--to {text}: {name} finds its receivers by itself; write --to {name}"
+            )
+        return Target(protocol=name)
     if separator and not rest:
         raise InputError(f"--to {text}: a host is missing after ://")
+    example = f"{name}://{LOOPBACK}:{usual_port}"
     try:
         parts = urlsplit(f"//{rest}")
         port = parts.port
     except ValueError:
         raise InputError(
-            f"--to {text}: the port must be a number from 1 to 65535, as in "
-            f"{protocol}://{LOOPBACK}:{DEFAULT_PORTS[protocol]}"
+            f"--to {text}: the port must be a number from 1 to 65535, as in {example}"
         ) from None
     if parts.path or parts.query or parts.fragment or parts.username is not None:
-        raise InputError(
-            f"--to {text}: expected only a host and a port, as in "
-            f"{protocol}://{LOOPBACK}:{DEFAULT_PORTS[protocol]}"
-        )
+        raise InputError(f"--to {text}: expected only a host and a port, as in {example}")
     if port == 0:
         raise InputError(f"--to {text}: the port must be a number from 1 to 65535")
-    return Target(
-        protocol=protocol,
-        host=parts.hostname or LOOPBACK,
-        port=port or DEFAULT_PORTS[protocol],
-    )
+    return Target(protocol=name, host=parts.hostname or LOOPBACK, port=port or usual_port)
+
+
+def serves(target: Target) -> bool:
+    """Whether receivers connect to it, rather than being sent to."""
+    return protocol_named(target.protocol).serves
 
 
 def is_loopback(host: str) -> bool:

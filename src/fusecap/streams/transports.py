@@ -1,8 +1,8 @@
-"""What carries packets: UDP, a WebSocket server, LSL outlets. None of them ever waits.
+"""What carries packets: UDP and a WebSocket server. Neither ever waits.
 
 A receiver that is missing, slow or stalled costs the sender nothing: UDP datagrams that the system
 does not take at once are dropped, a WebSocket client has a short queue of its own whose oldest
-message makes room for the newest, LSL buffers by itself.
+message makes room for the newest.
 """
 
 from __future__ import annotations
@@ -14,13 +14,10 @@ import logging
 import socket
 import threading
 from collections import deque
-from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from fusecap.body.skeleton import Skeleton
 from fusecap.errors import InputError
-from fusecap.streams.lsl import CONTENT_TYPE, COORDINATES, LslChannel, lsl_channels
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
@@ -40,7 +37,7 @@ class Counts:
     """What became of the packets so far."""
 
     sent: int = 0
-    """Taken by the operating system, or by the LSL library; not: received."""
+    """Taken by the operating system, or by a library; not: received."""
     bytes: int = 0
     dropped: int = 0
     """Because a buffer or a client's queue was full."""
@@ -244,64 +241,5 @@ class WebSocketServer:
             client.something.set()
 
 
-class LslOutlet:
-    """One person's LSL stream; raises `InputError` where the library is missing."""
-
-    def __init__(self, name: str, skeleton: Skeleton, rate_hz: float, counts: Counts) -> None:
-        self._counts = counts
-        self._lsl = _pylsl()
-        channels = lsl_channels(skeleton)
-        info = self._lsl.StreamInfo(
-            f"fusecap {name}",
-            CONTENT_TYPE,
-            len(channels),
-            rate_hz,
-            self._lsl.cf_float32,
-            f"fusecap-{name}",
-        )
-        _describe(info.desc(), channels, name)
-        self._outlet = self._lsl.StreamOutlet(info, max_buffered=10)
-        self.heard = False
-
-    def send(self, sample: Any) -> None:
-        """Push one float32 sample, stamped now."""
-        self._outlet.push_sample(sample, self._lsl.local_clock())
-        self._counts.sent += 1
-        self._counts.bytes += sample.nbytes
-        self.heard = self.heard or self._outlet.have_consumers()
-
-    def close(self) -> None:
-        del self._outlet
-
-
-def check_lsl() -> None:
-    """Raises `InputError` where the LSL library is missing."""
-    _pylsl()
-
-
-def _describe(description: Any, channels: Iterable[LslChannel], person: str) -> None:
-    description.append_child("acquisition").append_child_value("manufacturer", "fusecap")
-    setup = description.append_child("setup")
-    setup.append_child_value("person", person)
-    setup.append_child_value("coordinates", COORDINATES)
-    described = description.append_child("channels")
-    for channel in channels:
-        node = described.append_child("channel")
-        for key in ("label", "object", "type", "unit"):
-            node.append_child_value(key, getattr(channel, key))
-
-
 def _reason(error: OSError | UnicodeError) -> str:
     return getattr(error, "strerror", None) or str(error)
-
-
-def _pylsl() -> Any:
-    try:
-        import pylsl
-    except ImportError:
-        raise InputError(
-            "--to lsl needs the extra 'lsl'; install it with: pip install 'fusecap[lsl]'"
-        ) from None
-    except RuntimeError as error:
-        raise InputError(f"--to lsl: the LSL library cannot be loaded ({error})") from error
-    return pylsl

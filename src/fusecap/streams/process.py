@@ -1,11 +1,11 @@
-"""All streams of a run in one process of their own, so that encoding costs the solver nothing.
+"""All streams of a live run in one process of their own, so that encoding costs the solver nothing.
 
 Python computes on one thread at a time: what four streams encode, a few milliseconds per instant,
 would come out of the time between a sample and its pose. So the solver's thread only packs an
 instant's poses; a thread passes them on to a child, which sends them to one stream after the other.
 The child tells four times a second what it has sent and when; both processes read one clock.
 
-    python -m fusecap.live.stream_process        the child; pickles on stdin and stdout
+    python -m fusecap.streams.process        the child; pickles on stdin and stdout
 """
 
 from __future__ import annotations
@@ -17,49 +17,59 @@ import subprocess
 import sys
 import threading
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from typing import IO
 
-from fusecap.engine.engine import LiveStep
 from fusecap.errors import InputError
-from fusecap.live.devices.source import SessionClock
-from fusecap.live.latency import LatencyBook
-from fusecap.live.outputs import StreamOutput
-from fusecap.live.status import LiveStatus, StreamStatus
-from fusecap.streams.person_pose import pose_of_estimate
-from fusecap.streams.streams import Cast, open_stream
+from fusecap.streams.output import StreamOutput, StreamStatus
+from fusecap.streams.person_pose import PersonPose
+from fusecap.streams.stream import Cast, open_stream
 from fusecap.streams.target import Target
-from fusecap.types import CameraImage, Event
 
 QUEUE = 3
 """Instants that the child may lie behind before the oldest is lost."""
 _REPORT_S = 0.25
+_SENT = 4096
+"""Instants between two reports, at most."""
 _CLOSE_S = 4.0
 _PROTOCOL = pickle.HIGHEST_PROTOCOL
 
 
 class StreamProcess:
-    """A `Listener` that hands instants to the child; its `outputs` say how each stream goes."""
+    """Hands instants to the child, and knows how each of its streams goes."""
 
     def __init__(
         self,
         targets: Sequence[Target],
         cast: Cast,
         rate_hz: float,
-        clock: SessionClock,
-        latency: LatencyBook,
+        now_ns: Callable[[], int],
+        on_sent: Callable[[int, int, int], None],
     ) -> None:
-        """Raises `InputError` where a stream cannot be opened."""
-        self.outputs = tuple(RemoteOutput(target) for target in targets)
-        self._latency = latency
+        """`now_ns` is asked in the child; `on_sent` is told what `StreamOutput` tells.
+
+        Raises `InputError` where a stream cannot be opened.
+        """
+        self.addresses: tuple[dict[str, str], ...]
+        """Of each stream, the address per person where persons have addresses of their own."""
+        self.poses = (0,) * len(targets)
+        """Of each stream, instants sent so far."""
+        self.gone = False
+        """The child has ended by itself."""
+        self._told = tuple(
+            StreamStatus(to=str(target), sent=0, dropped=0, refused=0, failed=0, remark="")
+            for target in targets
+        )
+        self._on_sent = on_sent
         self._lost = 0
         self._queue: deque[bytes] = deque()
         self._changed = threading.Condition()
         self._closing = False
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "fusecap.live.stream_process"],
+            [sys.executable, "-m", "fusecap.streams.process"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
         )
@@ -67,7 +77,7 @@ class StreamProcess:
         self._to: IO[bytes] = self._process.stdin
         self._from: IO[bytes] = self._process.stdout
         try:
-            pickle.dump((tuple(targets), cast, rate_hz, clock), self._to, _PROTOCOL)
+            pickle.dump((tuple(targets), cast, rate_hz, now_ns), self._to, _PROTOCOL)
             self._to.flush()
             opened = pickle.load(self._from)
         except (OSError, EOFError):
@@ -75,8 +85,7 @@ class StreamProcess:
         if isinstance(opened, str):
             self._end()
             raise InputError(opened)
-        for output, where in zip(self.outputs, opened, strict=True):
-            output.addresses = where
+        self.addresses = opened
         self._threads = [
             threading.Thread(target=self._send, name="fusecap-streams", daemon=True),
             threading.Thread(target=self._hear, name="fusecap-streams-report", daemon=True),
@@ -84,24 +93,29 @@ class StreamProcess:
         for thread in self._threads:
             thread.start()
 
-    def on_event(self, event: Event, arrival_ns: int) -> None:
-        """Streams send poses only."""
+    def statuses(self) -> tuple[StreamStatus, ...]:
+        """How each stream goes."""
+        gone = "its process has ended; start the run again"
+        return tuple(
+            replace(
+                told,
+                dropped=told.dropped + self._lost,
+                remark=gone if self.gone else told.remark,
+            )
+            for told in self._told
+        )
 
-    def on_step(self, step: LiveStep, now_ns: int) -> None:
-        """Leave the instant's poses for the child."""
-        packed = pickle.dumps((step.timestamp_ns, dict(step.people), now_ns), _PROTOCOL)
+    def send(
+        self, poses: Mapping[str, PersonPose | None], timestamp_ns: int, handed_ns: int
+    ) -> None:
+        """Leave an instant's poses for the child; returns at once."""
+        packed = pickle.dumps((dict(poses), timestamp_ns, handed_ns), _PROTOCOL)
         with self._changed:
             if len(self._queue) >= QUEUE:
                 self._queue.popleft()
                 self._lost += 1
             self._queue.append(packed)
             self._changed.notify()
-
-    def on_image(self, image: CameraImage) -> None:
-        """Streams send poses only."""
-
-    def on_status(self, status: LiveStatus) -> None:
-        """Streams send poses only."""
 
     def close(self) -> None:
         """Send what waits, and end the child."""
@@ -129,14 +143,11 @@ class StreamProcess:
     def _hear(self) -> None:
         try:
             while (report := pickle.load(self._from)) is not None:
-                sent, told = report
+                sent, self._told, self.poses = report
                 for times_ns in sent:
-                    self._latency.sent(*times_ns)
-                for output, now in zip(self.outputs, told, strict=True):
-                    output.learn(*now, lost=self._lost)
+                    self._on_sent(*times_ns)
         except (OSError, EOFError, pickle.UnpicklingError):
-            for output in self.outputs:
-                output.gone = True
+            self.gone = True
 
     def _end(self) -> None:
         try:
@@ -149,106 +160,45 @@ class StreamProcess:
                 pipe.close()
 
 
-class RemoteOutput:
-    """How one stream of the child goes; `Sending`, and a listener that has nothing to do."""
-
-    def __init__(self, target: Target) -> None:
-        self.addresses: dict[str, str] = {}
-        self.gone = False
-        """The child has ended by itself."""
-        self.poses = 0
-        self._poses_per_s = 0.0
-        self._lost = 0
-        self._status = StreamStatus(
-            to=str(target), sent=0, dropped=0, refused=0, failed=0, remark=""
-        )
-
-    @property
-    def poses_per_s(self) -> float:
-        """Instants sent, over the last seconds."""
-        return 0.0 if self.gone else self._poses_per_s
-
-    def where(self) -> dict[str, str]:
-        """Address per person, where persons have addresses of their own."""
-        return self.addresses
-
-    def stream_status(self) -> StreamStatus:
-        """How it goes."""
-        status = self._status
-        return StreamStatus(
-            to=status.to,
-            sent=status.sent,
-            dropped=status.dropped + self._lost,
-            refused=status.refused,
-            failed=status.failed,
-            remark="its process has ended; start the run again" if self.gone else status.remark,
-        )
-
-    def learn(self, status: StreamStatus, poses: int, poses_per_s: float, *, lost: int) -> None:
-        """What the child tells."""
-        self._status, self.poses, self._poses_per_s, self._lost = status, poses, poses_per_s, lost
-
-    def on_event(self, event: Event, arrival_ns: int) -> None:
-        """The child's."""
-
-    def on_step(self, step: LiveStep, now_ns: int) -> None:
-        """The child's."""
-
-    def on_image(self, image: CameraImage) -> None:
-        """The child's."""
-
-    def on_status(self, status: LiveStatus) -> None:
-        """The child's."""
-
-    def close(self) -> None:
-        """The child's."""
-
-
-class _Sent(LatencyBook):
-    """Keeps when instants were sent, for the parent."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._sent: deque[tuple[int, int, int]] = deque(maxlen=4096)
-
-    def sent(self, timestamp_ns: int, taken_ns: int, sent_ns: int) -> None:
-        self._sent.append((timestamp_ns, taken_ns, sent_ns))
-
-    def taken(self) -> list[tuple[int, int, int]]:
-        """Those since the last call."""
-        return [self._sent.popleft() for _ in range(len(self._sent))]
-
-
 def _child(source: IO[bytes], sink: IO[bytes]) -> None:
     """Opens the streams, feeds them until the parent ends, and reports."""
-    targets, cast, rate_hz, clock = pickle.load(source)
-    sent, outputs = _Sent(), list[StreamOutput]()
+    targets, cast, rate_hz, now_ns = pickle.load(source)
+    sent = deque[tuple[int, int, int]](maxlen=_SENT)
+    outputs = list[StreamOutput]()
+
+    def on_sent(timestamp_ns: int, handed_ns: int, sent_ns: int) -> None:
+        sent.append((timestamp_ns, handed_ns, sent_ns))
+
     try:
         for target in targets:
             opened = partial(open_stream, target, rate_hz=rate_hz)
-            outputs.append(StreamOutput(opened, cast, clock, sent))
+            outputs.append(StreamOutput(opened, cast, now_ns, on_sent))
     except InputError as error:
         _tell(sink, str(error))
         _close(outputs)
         return
-    _tell(sink, [output.where() for output in outputs])
+    _tell(sink, tuple(output.where() for output in outputs))
     ended = threading.Event()
 
     def report() -> None:
         last = False
         while not last:
             last = ended.wait(_REPORT_S)
-            told = [(o.stream_status(), o.poses, o.poses_per_s) for o in outputs]
-            _tell(sink, (sent.taken(), told))
+            _tell(
+                sink,
+                (
+                    [sent.popleft() for _ in range(len(sent))],
+                    tuple(output.status() for output in outputs),
+                    tuple(output.poses for output in outputs),
+                ),
+            )
 
     reporting = threading.Thread(target=report, daemon=True)
     reporting.start()
     with suppress(EOFError):  # the parent is gone
         while (instant := pickle.load(source)) is not None:
-            timestamp_ns, people, handed_ns = instant
-            poses = {name: each and pose_of_estimate(each) for name, each in people.items()}
             for output in outputs:
-                output.send(poses, timestamp_ns, handed_ns)
+                output.send(*instant)
     _close(outputs)
     ended.set()
     reporting.join()

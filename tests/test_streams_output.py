@@ -13,9 +13,11 @@ from websockets.sync.client import connect
 from fusecap.errors import InputError
 from fusecap.live.devices.source import SessionClock
 from fusecap.live.latency import LatencyBook
-from fusecap.live.outputs import StreamOutput, first_cast
+from fusecap.live.streaming import first_cast
+from fusecap.streams.output import StreamOutput
 from fusecap.streams.person_pose import pose_of_estimate
-from fusecap.streams.streams import VmcStream, open_stream
+from fusecap.streams.protocols.vmc import VmcStream
+from fusecap.streams.stream import open_stream
 from fusecap.streams.target import Target, parse_target
 from fusecap.streams.transports import Counts
 from fusecap.types import Estimate
@@ -51,7 +53,7 @@ class KeepingStream:
 
 
 def output_to(stream, cast=None) -> StreamOutput:
-    return StreamOutput(lambda cast: stream, cast or {}, SessionClock(), LatencyBook())
+    return StreamOutput(lambda cast: stream, cast or {}, SessionClock().now_ns, LatencyBook().sent)
 
 
 def free_port(kind=socket.SOCK_STREAM) -> int:
@@ -80,16 +82,16 @@ def test_a_stream_that_raises_says_so_and_goes_on():
     output = output_to(stream)
     send(output, step_with(0), 0)
     wait_for(lambda: stream.counts.failed)
-    assert output.stream_status().remark == "ValueError: no such packet"
+    assert output.status().remark == "ValueError: no such packet"
     send(output, step_with(1), 0)
     wait_for(lambda: output.poses == 1)
-    assert output.stream_status().remark == ""
+    assert output.status().remark == ""
     output.close()
 
 
 def test_latency_is_that_of_the_packet():
     clock, book, stream = SessionClock(), LatencyBook(), KeepingStream()
-    output = StreamOutput(lambda cast: stream, {}, clock, book)
+    output = StreamOutput(lambda cast: stream, {}, clock.now_ns, book.sent)
     now_ns = clock.now_ns()
     book.solved(now_ns - 50_000_000, now_ns - 20_000_000)
     send(output, step_with(now_ns - 50_000_000), now_ns)
@@ -126,7 +128,7 @@ def test_a_body_that_is_measured_is_told_once_a_second_at_most():
             return self.now
 
     clock, stream = Clock(), KeepingStream()
-    output = StreamOutput(lambda cast: stream, {"anna": person()}, clock, LatencyBook())
+    output = StreamOutput(lambda cast: stream, {"anna": person()}, clock.now_ns, LatencyBook().sent)
     for number in range(4):
         clock.now = number * 600_000_000
         send(output, step_with(number, estimate_of(number, shape=person(1.6 + 0.01 * number))), 0)
@@ -151,9 +153,11 @@ def test_vmc_without_room_for_someone_says_so_and_serves_the_others():
     stream = VmcStream(parse_target(f"vmc://{HOST}:65530"), {"anna": person()})
     with pytest.raises(InputError, match="2 people need ports up to 65540"):
         stream.set_cast({"anna": person(), "ben": person()})
-    output = StreamOutput(lambda cast: stream, {"anna": person()}, SessionClock(), LatencyBook())
+    output = StreamOutput(
+        lambda cast: stream, {"anna": person()}, SessionClock().now_ns, LatencyBook().sent
+    )
     send(output, step_with(0, estimate_of(0), estimate_of(0, "ben")), 0)
-    wait_for(lambda: output.stream_status().remark)
+    wait_for(lambda: output.status().remark)
     send(output, step_with(1, estimate_of(1), estimate_of(1, "ben")), 0)
     wait_for(lambda: stream.counts.sent + stream.counts.refused > 1)
     output.close()
@@ -164,12 +168,12 @@ def test_clients_of_the_websocket_hear_of_a_new_person():
     output = StreamOutput(
         lambda cast: open_stream(target, cast, 60.0),
         {"anna": person()},
-        SessionClock(),
-        LatencyBook(),
+        SessionClock().now_ns,
+        LatencyBook().sent,
     )
     with connect(str(target), compression=None) as client:
         assert [p["name"] for p in json.loads(client.recv(10))["people"]] == ["anna"]
-        wait_for(lambda: not output.stream_status().remark)
+        wait_for(lambda: not output.status().remark)
         send(output, step_with(1, estimate_of(1), estimate_of(1, "guest")), 0)
         message = json.loads(client.recv(10))
         assert message["type"] == "cast"
@@ -194,8 +198,8 @@ def test_a_websocket_client_that_never_reads_and_a_port_without_a_listener_hold_
             StreamOutput(
                 lambda cast, target=target: open_stream(target, cast, 60.0),
                 {"anna": person()},
-                clock,
-                book,
+                clock.now_ns,
+                book.sent,
             )
             for target in targets
         ]
@@ -205,9 +209,9 @@ def test_a_websocket_client_that_never_reads_and_a_port_without_a_listener_hold_
             b"GET / HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
             b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
         )
-        wait_for(lambda: not outputs[0].stream_status().remark)
+        wait_for(lambda: not outputs[0].status().remark)
         number = -1
-        while number < 300 or not outputs[0].stream_status().dropped:
+        while number < 300 or not outputs[0].status().dropped:
             number += 1
             assert number < 20_000, "the system's buffers take more than any client has"
             for output in outputs:
@@ -215,9 +219,9 @@ def test_a_websocket_client_that_never_reads_and_a_port_without_a_listener_hold_
             wait_for(lambda number=number: outputs[2].poses == number + 1)
             first = well.recv(65536)
             well.recv(65536)
-        assert outputs[1].stream_status().failed == 0
+        assert outputs[1].status().failed == 0
         addresses = [message.address for message in OscBundle(first)]
         assert addresses[0] == "/fusecap/time"
         for output in outputs:
             output.close()
-    assert np.all([output.stream_status().sent > 0 for output in outputs])
+    assert np.all([output.status().sent > 0 for output in outputs])

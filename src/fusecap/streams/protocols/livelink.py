@@ -26,8 +26,8 @@ from fusecap.streams.person_pose import (
     StreamFrame,
     in_parents,
 )
+from fusecap.streams.stream import udp_protocol
 
-DEFAULT_PORT = 54321
 MAX_BYTES = 8192
 """Of a datagram with several subjects: macOS sends no more than 9216 unless told to."""
 
@@ -88,3 +88,6 @@ def _bones(pose: PersonPose) -> list[dict[str, Any]]:
             _NAMES, parents, locations_cm, quaternions, strict=True
         )
     ]
+
+
+PROTOCOL = udp_protocol(lambda frame, rate_hz: livelink_datagrams(frame), port=54321)

@@ -14,8 +14,7 @@ from collections.abc import Iterable
 
 from fusecap.streams.osc_packets import bundles, message
 from fusecap.streams.person_pose import StreamFrame
-
-DEFAULT_PORT = 9000
+from fusecap.streams.stream import udp_protocol
 
 
 def osc_datagrams(frame: StreamFrame) -> list[bytes]:
@@ -49,3 +48,6 @@ def person_addresses(names: Iterable[str]) -> list[str]:
             address = f"/fusecap/{kept}_{number}"
         addresses.append(address)
     return addresses
+
+
+PROTOCOL = udp_protocol(lambda frame, rate_hz: osc_datagrams(frame), port=9000)

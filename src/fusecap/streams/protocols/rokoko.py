@@ -32,8 +32,7 @@ from fusecap.streams.person_pose import (
     PersonPose,
     StreamFrame,
 )
-
-DEFAULT_PORT = 14043
+from fusecap.streams.stream import udp_protocol
 
 _H = np.sqrt(0.5)
 _UPRIGHT = (0.0, 0.0, 1.0, 0.0)
@@ -113,3 +112,6 @@ def _actor(pose: PersonPose, colour: tuple[int, int, int]) -> dict[str, Any]:
             for name, xyz, xyzw in zip(_ACTOR, positions, quaternions, strict=True)
         },
     }
+
+
+PROTOCOL = udp_protocol(rokoko_datagrams, port=14043)

@@ -1,34 +1,31 @@
-"""One stream of a live run: instants become frames, and who is in them becomes its cast."""
+"""One stream of live poses: instants become frames, and who is in them becomes its cast."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
-from fusecap.body.shape import REFERENCE_HEIGHT_M, BodyShape
-from fusecap.live.devices.source import SessionClock
-from fusecap.live.health import Meter
-from fusecap.live.latency import LatencyBook
-from fusecap.live.status import StreamStatus
-from fusecap.setup import SessionSetup
+from fusecap.body.shape import BodyShape
 from fusecap.streams.person_pose import PersonPose, StreamFrame
-from fusecap.streams.streams import Cast, Stream
+from fusecap.streams.stream import Cast, Stream
 
 _NEWS_EVERY_NS = 1_000_000_000
 """Between two announcements that a body is now measured otherwise."""
 _SAME_BODY_M = 0.002
 
 
-def first_cast(setup: SessionSetup) -> Cast:
-    """The session's people with the bodies known so far, before anyone is found."""
-    skeleton = setup.session.skeleton
-    return {
-        subject.name: BodyShape.from_height(
-            skeleton, subject.height_m or REFERENCE_HEIGHT_M
-        ).with_lengths(subject.bone_lengths_m)
-        for subject in setup.session.subjects
-    }
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StreamStatus:
+    """One receiver."""
+
+    to: str
+    sent: int
+    dropped: int
+    refused: int
+    failed: int
+    remark: str
 
 
 class StreamOutput:
@@ -38,33 +35,27 @@ class StreamOutput:
         self,
         open_stream: Callable[[Cast], Stream],
         cast: Cast,
-        clock: SessionClock,
-        latency: LatencyBook,
+        now_ns: Callable[[], int],
+        on_sent: Callable[[int, int, int], None],
     ) -> None:
-        """Raises what opening the stream raises."""
+        """Raises what opening the stream raises.
+
+        `on_sent` hears of which instant a pose was sent, when that was handed over, and when sent.
+        """
+        self.poses = 0
+        """Instants sent so far."""
         self._cast = dict(cast)
         self._stream = open_stream(dict(cast))
-        self._clock = clock
-        self._latency = latency
-        self._meter = Meter()
+        self._now_ns = now_ns
+        self._on_sent = on_sent
         self._trouble = ""
-        self._told_ns = clock.now_ns()
-
-    @property
-    def poses(self) -> int:
-        """Instants sent so far."""
-        return self._meter.total
-
-    @property
-    def poses_per_s(self) -> float:
-        """Instants sent, over the last seconds."""
-        return self._meter.rate_hz(self._clock.now_ns())
+        self._told_ns = now_ns()
 
     def where(self) -> dict[str, str]:
         """Address per person, where persons have addresses of their own."""
         return self._stream.where()
 
-    def stream_status(self) -> StreamStatus:
+    def status(self) -> StreamStatus:
         """How it goes."""
         counts = self._stream.counts
         return StreamStatus(
@@ -93,9 +84,8 @@ class StreamOutput:
             self._stream.counts.failed += 1
             self._trouble = f"{type(error).__name__}: {error}"
             return
-        now_ns = self._clock.now_ns()
-        self._meter.add(now_ns)
-        self._latency.sent(timestamp_ns, handed_ns, now_ns)
+        self.poses += 1
+        self._on_sent(timestamp_ns, handed_ns, self._now_ns())
         self._trouble = ""
 
     def close(self) -> None:
@@ -110,7 +100,7 @@ class StreamOutput:
         }
         known = {name: shape for name, shape in cast.items() if shape is not None}
         if list(known) == list(self._cast):
-            now_ns = self._clock.now_ns()
+            now_ns = self._now_ns()
             if now_ns - self._told_ns < _NEWS_EVERY_NS:
                 return
             if all(_alike(shape, self._cast[name]) for name, shape in known.items()):

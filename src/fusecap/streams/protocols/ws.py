@@ -28,8 +28,10 @@ from scipy.spatial.transform import Rotation
 from fusecap.body.shape import BodyShape
 from fusecap.geometry.quaternions import to_wxyz
 from fusecap.streams.person_pose import StreamFrame
+from fusecap.streams.stream import Cast, StreamProtocol
+from fusecap.streams.target import Target
+from fusecap.streams.transports import Counts, WebSocketServer
 
-DEFAULT_PORT = 8765
 FORMAT = "fusecap stream 1"
 MAGIC = b"FCS1"
 UNITS = {
@@ -104,3 +106,42 @@ def frame_bytes(frame: StreamFrame) -> bytes:
             values.astype("<f4").tobytes(),
         ]
     return b"".join(parts)
+
+
+class WebSocketStream:
+    """Everyone to every client."""
+
+    def __init__(self, target: Target, cast: Cast, rate_hz: float) -> None:
+        self.target = target
+        self.counts = Counts()
+        self._server = WebSocketServer(target.host, target.port, self.counts)
+        self._rate_hz = rate_hz
+        self.set_cast(cast)
+
+    def send(self, frame: StreamFrame) -> None:
+        wants = self._server.wants
+        if wants:
+            self._server.publish(
+                frame_text(frame) if False in wants else None,
+                frame_bytes(frame) if True in wants else None,
+            )
+
+    def set_cast(self, cast: Cast) -> None:
+        """Tells every client."""
+        self._server.publish_cast(cast_message(cast.items(), self._rate_hz))
+
+    def remark(self) -> str:
+        if not self._server.clients_ever:
+            return f"no client has connected; open {self.target} or {self.target}/binary"
+        if self.counts.dropped:
+            return "a client is too slow and misses frames"
+        return ""
+
+    def where(self) -> dict[str, str]:
+        return {}
+
+    def close(self) -> None:
+        self._server.close()
+
+
+PROTOCOL = StreamProtocol(open=WebSocketStream, port=8765, serves=True)
