@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from fusecap.body.pose import forward_kinematics
 from fusecap.body.shape import BodyShape
 from fusecap.body.skeleton import EXTENDED23, PAPER21
-from fusecap.kernels import cholesky, kinematics, lie, projection
+from fusecap.kernels import cholesky, groups, kinematics, lie, projection
 from scenes import random_pose, ring
 
 vectors = arrays(np.float64, 3, elements=st.floats(-6.0, 6.0))
@@ -63,12 +63,15 @@ def test_kernel_kinematics_agree_with_the_vectorised_ones(skeleton, rng):
     position, rotation = np.full((b, 3), np.inf), np.full((b, 3, 3), np.inf)
     kinematics.forward(
         theta,
-        skeleton.parent_array,
-        shape.offsets_m,
-        position,
-        rotation,
-        np.full((b, 3, 3), np.inf),
-        np.zeros((3, 3)),
+        groups.Body(parents=skeleton.parent_array, offsets=shape.offsets_m),
+        groups.Posed(position=position, rotation=rotation, twist=np.full((b, 3, 3), np.inf)),
+        groups.Scratch(
+            local=np.zeros((3, 3)),
+            information=np.zeros((3, 3)),
+            gradient=np.zeros(3),
+            motion=np.zeros((b, 6, 3)),
+            force=np.zeros((6, 3)),
+        ),
     )
     expected_position, expected_rotation = forward_kinematics(shape, theta[None])
     np.testing.assert_allclose(position, expected_position[0], atol=1e-12)

@@ -19,6 +19,10 @@ number of landmarks or cameras. The origin is the root joint, to keep the arms o
 
 from __future__ import annotations
 
+from numba import float64 as f8
+from numba import void
+
+from fusecap.kernels.groups import BODY, GATHERED, POSED, SCRATCH
 from fusecap.kernels.jit import kernel
 
 
@@ -61,30 +65,16 @@ def add_point(x, y, z, point_information, point_gradient, information_out, gradi
     gradient_out[5] += x * gy - y * gx
 
 
-@kernel(
-    "void(i8[::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1], "
-    "f8[:, ::1], f8[:, ::1], f8[::1])"
-)
-def assemble(
-    # Body in:
-    parents,
-    position,
-    twist,
-    # Gathered in (consumed: children are summed into parents):
-    information,
-    gradient,
-    # Scratch:
-    motion,
-    force,
-    # Normal equations out:
-    hessian_out,
-    gradient_out,
-):
+@kernel(void(BODY, POSED, GATHERED, SCRATCH, f8[:, ::1], f8[::1]))
+def assemble(body, posed, gathered, scratch, hessian_out, gradient_out):
     """Add the gathered information to the lower triangle of H (3 + 3B, 3 + 3B) and to g (3 + 3B,).
 
-    information (B, 6, 6) needs its upper right block and both diagonal ones; motion (B, 6, 3) and
-    force (6, 3) are scratch.
+    It needs its upper right block and both diagonal ones, and is consumed: children are summed into
+    parents.
     """
+    parents, position, twist = body.parents, posed.position, posed.twist
+    information, gradient = gathered.information, gathered.gradient
+    motion, force = scratch.motion, scratch.force
     bones = parents.size
     for bone in range(bones - 1, 0, -1):
         parent = parents[bone]

@@ -42,7 +42,7 @@ def _drop_stale_cache() -> None:
         stamp_file.write_text(stamp)
 
 
-def kernel(signature: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+def kernel(signature: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Compile a function for one explicit signature; says so once when the cache is cold."""
 
     def compile_now(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -12,7 +12,30 @@ comes back, with status DIVERGED.
 
 from __future__ import annotations
 
+from numba import float64 as f8
+from numba import int64 as i8
+from numba import types
+
 from fusecap.kernels.cholesky import factor, solve_factored
+from fusecap.kernels.groups import (
+    GATHERED,
+    MEASURED,
+    MODEL,
+    POSED,
+    SCRATCH,
+    Body,
+    Floor,
+    Gathered,
+    Landmarks,
+    Measured,
+    Model,
+    Posed,
+    Prior,
+    Scratch,
+    Sensors,
+    Weights,
+    plain_type,
+)
 from fusecap.kernels.information import assemble
 from fusecap.kernels.jit import FINITE, kernel
 from fusecap.kernels.kinematics import forward
@@ -27,131 +50,48 @@ CONVERGED = 0
 ITERATION_LIMIT = 1
 DIVERGED = 2
 
-# Arguments that evaluate and solve share, in order; see evaluate for what each means.
-_BODY = "i8[::1], f8[:, ::1]"
-_CAMERAS = "i8[::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1]"
-_IMUS = "i8[::1], f8[:, :, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8"
-_PRIORS = "f8[::1], f8[:, ::1], f8[:, ::1], i8[::1], f8, f8[::1]"
-_INPUTS = f"{_BODY}, {_CAMERAS}, {_IMUS}, {_PRIORS}"
-_POSED = "f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1]"
-_SCRATCH = "f8[:, ::1], f8[:, ::1], f8[::1], f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, ::1]"
+_PLAIN = plain_type(MODEL, MEASURED, POSED, GATHERED, SCRATCH)
+_MATRIX, _VECTOR = f8[:, ::1], f8[::1]
 
 
-@kernel(f"f8(f8[::1], {_INPUTS}, {_POSED}, {_SCRATCH}, f8[:, ::1], f8[::1])")
-def evaluate(
-    theta,
-    # Body in: parents (B,), offsets (B, 3).
-    parents,
-    offsets,
-    # Cameras in: landmarks on bones, packed cameras (C, 24), keypoints (C, K, 3).
-    landmark_bone,
-    landmark_offset,
-    cameras,
-    keypoints,
-    # IMUs in: see the orientation and acceleration terms.
-    imu_bone,
-    imu_rotation,
-    imu_weight,
-    imu_offset,
-    imu_accel,
-    imu_history,
-    dt,
-    # Priors in: PCA mean (3B - 3,), its two matrices, floor joints and radius. Weights (6,) in the
-    # order position, orientation, acceleration, projection, deviation, floor; 0 switches one off.
-    prior_mean,
-    prior_projector,
-    prior_precision,
-    floor_bone,
-    floor_radius,
-    weights,
-    # Posed body out:
-    position_out,
-    rotation_out,
-    twist_out,
-    # Scratch:
-    local,
-    point_information,
-    point_gradient,
-    information,
-    gathered,
-    motion,
-    force,
-    # Normal equations out (lower triangle of H):
-    hessian_out,
-    gradient_out,
-):
-    """Cost at theta, with H and g."""
-    forward(theta, parents, offsets, position_out, rotation_out, twist_out, local)
-    information[:] = 0.0
-    gathered[:] = 0.0
+@kernel(f8(_VECTOR, MODEL, MEASURED, POSED, GATHERED, SCRATCH, _MATRIX, _VECTOR))
+def evaluate(theta, model, measured, posed, gathered, scratch, hessian_out, gradient_out):
+    """Cost at theta, with the lower triangle of H (P, P), and g (P,); leaves the posed body."""
+    weights, prior = model.weights, model.prior
+    forward(theta, model.body, posed, scratch)
+    gathered.information[:] = 0.0
+    gathered.gradient[:] = 0.0
     hessian_out[:] = 0.0
     gradient_out[:] = 0.0
     cost = 0.0
-    if weights[0] > 0.0:
+    if weights.position > 0.0:
         cost += add_position(
-            weights[0],
-            landmark_bone,
-            landmark_offset,
-            cameras,
-            keypoints,
-            position_out,
-            rotation_out,
-            point_information,
-            point_gradient,
-            information,
-            gathered,
+            weights.position, model.landmarks, measured.keypoints, posed, scratch, gathered
         )
-    if weights[1] > 0.0:
-        cost += add_orientation(
-            weights[1], imu_bone, imu_rotation, imu_weight, rotation_out, information, gathered
-        )
-    if weights[2] > 0.0:
+    if weights.orientation > 0.0:
+        cost += add_orientation(weights.orientation, model.sensors, measured, posed, gathered)
+    if weights.acceleration > 0.0:
         cost += add_acceleration(
-            weights[2],
-            imu_bone,
-            imu_offset,
-            imu_accel,
-            imu_history,
-            dt,
-            position_out,
-            rotation_out,
-            point_information,
-            point_gradient,
-            information,
-            gathered,
+            weights.acceleration, model.sensors, measured, posed, scratch, gathered
         )
-    if weights[5] > 0.0:
-        cost += add_floor(
-            weights[5],
-            floor_bone,
-            floor_radius,
-            position_out,
-            point_information,
-            point_gradient,
-            information,
-            gathered,
+    if weights.floor > 0.0:
+        cost += add_floor(weights.floor, model.floor, posed, scratch, gathered)
+    assemble(model.body, posed, gathered, scratch, hessian_out, gradient_out)
+    if weights.projection > 0.0:
+        cost += add_prior(
+            weights.projection, prior.mean, prior.projector, theta, hessian_out, gradient_out
         )
-    assemble(
-        parents,
-        position_out,
-        twist_out,
-        information,
-        gathered,
-        motion,
-        force,
-        hessian_out,
-        gradient_out,
-    )
-    if weights[3] > 0.0:
-        cost += add_prior(weights[3], prior_mean, prior_projector, theta, hessian_out, gradient_out)
-    if weights[4] > 0.0:
-        cost += add_prior(weights[4], prior_mean, prior_precision, theta, hessian_out, gradient_out)
+    if weights.deviation > 0.0:
+        cost += add_prior(
+            weights.deviation, prior.mean, prior.precision, theta, hessian_out, gradient_out
+        )
     return cost
 
 
 @kernel(
-    f"Tuple((i8, i8, f8))(f8[::1], i8, f8, f8, {_INPUTS}, {_POSED}, {_SCRATCH}, "
-    "f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8[::1])"
+    types.Tuple([i8, i8, f8])(
+        _VECTOR, i8, f8, f8, _PLAIN, f8[:, :, ::1], _MATRIX, _MATRIX, _VECTOR, _VECTOR, _VECTOR
+    )
 )
 def solve(
     # Pose in and out, made canonical (angles at most pi) at the end:
@@ -160,36 +100,8 @@ def solve(
     max_iterations,
     function_tolerance,
     initial_damping,
-    # The same inputs, posed body and scratch as evaluate:
-    parents,
-    offsets,
-    landmark_bone,
-    landmark_offset,
-    cameras,
-    keypoints,
-    imu_bone,
-    imu_rotation,
-    imu_weight,
-    imu_offset,
-    imu_accel,
-    imu_history,
-    dt,
-    prior_mean,
-    prior_projector,
-    prior_precision,
-    floor_bone,
-    floor_radius,
-    weights,
-    position,
-    rotation,
-    twist,
-    local,
-    point_information,
-    point_gradient,
-    information,
-    gathered,
-    motion,
-    force,
+    # (model, measured, posed, gathered, scratch) as `groups.plain` gives it.
+    inputs,
     # Scratch: H (2, n, n) and g (2, n), current and trial; Cholesky factor, damping, step, trial.
     hessian,
     gradient,
@@ -199,14 +111,21 @@ def solve(
     trial,
 ):
     """(status, iterations, cost). hessian[0] and gradient[0] end up at the returned pose."""
+    constant = inputs[0]
+    model = Model(
+        Weights(*constant[0]),
+        Body(*constant[1]),
+        Landmarks(*constant[2]),
+        Sensors(*constant[3]),
+        Prior(*constant[4]),
+        Floor(*constant[5]),
+    )
+    measured = Measured(*inputs[1])
+    posed = Posed(*inputs[2])
+    gathered = Gathered(*inputs[3])
+    scratch = Scratch(*inputs[4])
     size = theta.size
-    cost = evaluate(
-        theta, parents, offsets, landmark_bone, landmark_offset, cameras, keypoints,
-        imu_bone, imu_rotation, imu_weight, imu_offset, imu_accel, imu_history, dt,
-        prior_mean, prior_projector, prior_precision, floor_bone, floor_radius, weights,
-        position, rotation, twist, local, point_information, point_gradient,
-        information, gathered, motion, force, hessian[0], gradient[0],
-    )  # fmt: skip
+    cost = evaluate(theta, model, measured, posed, gathered, scratch, hessian[0], gradient[0])
     if not cost < FINITE:
         return DIVERGED, 0, cost
     mu = initial_damping
@@ -241,12 +160,8 @@ def solve(
             break
         other = 1 - current
         trial_cost = evaluate(
-            trial, parents, offsets, landmark_bone, landmark_offset, cameras, keypoints,
-            imu_bone, imu_rotation, imu_weight, imu_offset, imu_accel, imu_history, dt,
-            prior_mean, prior_projector, prior_precision, floor_bone, floor_radius, weights,
-            position, rotation, twist, local, point_information, point_gradient,
-            information, gathered, motion, force, hessian[other], gradient[other],
-        )  # fmt: skip
+            trial, model, measured, posed, gathered, scratch, hessian[other], gradient[other]
+        )
         if trial_cost < cost:
             moved = True
             decrease = cost - trial_cost
@@ -269,7 +184,7 @@ def solve(
     if status != CONVERGED and not moved:
         status = DIVERGED
     wrap_pose(theta)
-    forward(theta, parents, offsets, position, rotation, twist, local)
+    forward(theta, model.body, posed, scratch)
     if current == 1:
         hessian[0] = hessian[1]
         gradient[0] = gradient[1]

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, fields
 
-import numpy as np
-
 from fusecap.errors import InputError, nearest
 
 
@@ -53,11 +51,6 @@ class Weights:
     def paper(cls) -> Weights:
         """All terms as printed."""
         return cls(orientation=1.0, acceleration=1e-3)
-
-    @property
-    def array(self) -> np.ndarray:
-        """In the order of the kernels."""
-        return np.array([getattr(self, term.name) for term in fields(self)], dtype=np.float64)
 
 
 @dataclass(frozen=True, kw_only=True)

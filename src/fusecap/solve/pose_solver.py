@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +12,7 @@ from fusecap.body.prior import PosePrior
 from fusecap.body.shape import BodyShape
 from fusecap.errors import InputError
 from fusecap.geometry.camera import Rig
-from fusecap.kernels import cholesky
+from fusecap.kernels import cholesky, groups
 from fusecap.kernels import solve as kernels
 from fusecap.solve.options import SolverOptions
 from fusecap.types import Status
@@ -93,24 +92,29 @@ class PoseSolver:
         self.sites = sites or ImuSites.none()
         self._rig = rig.packed
         self._landmark_bone = landmarks.bones(skeleton)
-        self._imu_bone = np.array(self.sites.bone, dtype=np.int64)
-        self._imu_weight = np.zeros(len(self.sites.bone))
-        self._prior = (prior.mean, prior.projector, prior.precision)
-        self._floor_bone = np.array([skeleton.bone(name) for name in _FLOOR_BONES], dtype=np.int64)
-        self._weights = self.options.weights.array
+        self._sensors = groups.Sensors(
+            bone=np.array(self.sites.bone, dtype=np.int64), offset=self.sites.position_m
+        )
+        self._present = np.zeros(len(self.sites.bone))
+        self._prior = groups.Prior(
+            mean=prior.mean, projector=prior.projector, precision=prior.precision
+        )
+        self._floor = groups.Floor(
+            bone=np.array([skeleton.bone(name) for name in _FLOOR_BONES], dtype=np.int64),
+            radius=self.options.floor_radius_m,
+        )
         self._prior_variance = self._variance_under_prior(prior)
         n, b = skeleton.pose_size, skeleton.bone_count
-        self._position = np.zeros((b, 3))
-        self._rotation = np.zeros((b, 3, 3))
-        self._posed = (self._position, self._rotation, np.zeros((b, 3, 3)))
-        self._scratch = (
-            np.zeros((3, 3)),
-            np.zeros((3, 3)),
-            np.zeros(3),
-            np.zeros((b, 6, 6)),
-            np.zeros((b, 6)),
-            np.zeros((b, 6, 3)),
-            np.zeros((6, 3)),
+        self._posed = groups.Posed(
+            position=np.zeros((b, 3)), rotation=np.zeros((b, 3, 3)), twist=np.zeros((b, 3, 3))
+        )
+        self._gathered = groups.Gathered(information=np.zeros((b, 6, 6)), gradient=np.zeros((b, 6)))
+        self._scratch = groups.Scratch(
+            local=np.zeros((3, 3)),
+            information=np.zeros((3, 3)),
+            gradient=np.zeros(3),
+            motion=np.zeros((b, 6, 3)),
+            force=np.zeros((6, 3)),
         )
         self._hessian = np.zeros((2, n, n))
         self._gradient = np.zeros((2, n))
@@ -122,10 +126,27 @@ class PoseSolver:
     def set_shape(self, shape: BodyShape, landmark_offsets_m: np.ndarray | None = None) -> None:
         """Change bone lengths, and landmark offsets (by default those of the stature)."""
         self.shape = shape
-        self._offsets = np.ascontiguousarray(shape.offsets_m, dtype=np.float64)
         if landmark_offsets_m is None:
             landmark_offsets_m = self.landmarks.offsets_m(shape)
         self.landmark_offsets_m = np.ascontiguousarray(landmark_offsets_m, dtype=np.float64)
+        weights = self.options.weights
+        self.model = groups.Model(
+            weights=groups.Weights(
+                *(float(getattr(weights, name)) for name in groups.Weights._fields)
+            ),
+            body=groups.Body(
+                parents=self.skeleton.parent_array,
+                offsets=np.ascontiguousarray(shape.offsets_m, dtype=np.float64),
+            ),
+            landmarks=groups.Landmarks(
+                bone=self._landmark_bone, offset=self.landmark_offsets_m, cameras=self._rig
+            ),
+            sensors=self._sensors,
+            prior=self._prior,
+            floor=self._floor,
+        )
+        self._plain_model = groups.plain(self.model)
+        self._plain_room = groups.plain((self._posed, self._gathered, self._scratch))
 
     def solve(self, theta: Float[np.ndarray, " p"], data: Measurements) -> Solution:
         """Minimise from `theta`; always returns finite numbers when `theta` is finite."""
@@ -136,9 +157,7 @@ class PoseSolver:
             options.max_iterations,
             options.function_tolerance,
             options.initial_damping,
-            *self._inputs(data),
-            *self._posed,
-            *self._scratch,
+            self._inputs(data),
             self._hessian,
             self._gradient,
             self._lower,
@@ -146,9 +165,9 @@ class PoseSolver:
         )
         return Solution(
             theta=result,
-            position_in_world_m=self._position.copy(),
-            rotation_in_world=self._rotation.copy(),
-            bone_quality=self._quality() if options.quality else np.ones(len(self._position)),
+            position_in_world_m=self._posed.position.copy(),
+            rotation_in_world=self._posed.rotation.copy(),
+            bone_quality=self._quality() if options.quality else np.ones(self.skeleton.bone_count),
             status=Status(status),
             iterations=iterations,
             cost=cost,
@@ -160,38 +179,33 @@ class PoseSolver:
         """Cost, gradient and Gauss-Newton matrix at `theta`, for checks and for other solvers."""
         cost = kernels.evaluate(
             np.ascontiguousarray(theta, dtype=np.float64),
-            *self._inputs(data),
-            *self._posed,
-            *self._scratch,
+            self.model,
+            self._measured(data),
+            self._posed,
+            self._gathered,
+            self._scratch,
             self._hessian[0],
             self._gradient[0],
         )
         lower = np.tril(self._hessian[0])
         return cost, self._gradient[0].copy(), lower + np.tril(lower, -1).T
 
-    def _inputs(self, data: Measurements) -> Sequence[object]:
+    def _inputs(self, data: Measurements) -> tuple[object, ...]:
+        """What `kernels.solve` takes, in its order."""
+        return (self._plain_model, tuple(self._measured(data)), *self._plain_room)
+
+    def _measured(self, data: Measurements) -> groups.Measured:
         expected = (len(self._rig), len(self._landmark_bone), 3)
         if data.keypoints.shape != expected:
             raise InputError(f"keypoints are {data.keypoints.shape}; expected {expected}")
-        self._imu_weight[:] = np.isfinite(data.imu_rotation[:, 0, 0])
-        return (
-            self.skeleton.parent_array,
-            self._offsets,
-            self._landmark_bone,
-            self.landmark_offsets_m,
-            self._rig,
-            data.keypoints,
-            self._imu_bone,
-            data.imu_rotation,
-            self._imu_weight,
-            self.sites.position_m,
-            data.imu_accel,
-            data.imu_history,
-            data.dt_s,
-            *self._prior,
-            self._floor_bone,
-            self.options.floor_radius_m,
-            self._weights,
+        self._present[:] = np.isfinite(data.imu_rotation[:, 0, 0])
+        return groups.Measured(
+            keypoints=data.keypoints,
+            rotation=data.imu_rotation,
+            present=self._present,
+            accel=data.imu_accel,
+            history=data.imu_history,
+            dt=data.dt_s,
         )
 
     def _quality(self) -> np.ndarray:

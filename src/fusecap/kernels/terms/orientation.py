@@ -12,6 +12,9 @@ from __future__ import annotations
 
 import math
 
+from numba import float64 as f8
+
+from fusecap.kernels.groups import GATHERED, MEASURED, POSED, SENSORS
 from fusecap.kernels.jit import kernel
 
 
@@ -54,34 +57,23 @@ def relative_quaternion(a, b):
     return w * scale, x * scale, y * scale, z * scale
 
 
-@kernel("f8(f8, i8[::1], f8[:, :, ::1], f8[::1], f8[:, :, ::1], f8[:, :, ::1], f8[:, ::1])")
-def add_orientation(
-    # Term in:
-    weight,
-    imu_bone,
-    imu_rotation,
-    imu_weight,
-    # Body in:
-    rotation,
-    # Gathered out:
-    information_out,
-    gradient_out,
-):
-    """½ Σ λ w ‖v‖²; imu_rotation (I, 3, 3) is R_ig R_i R_ib⁻¹, skipped where imu_weight is 0."""
+@kernel(f8(f8, SENSORS, MEASURED, POSED, GATHERED))
+def add_orientation(weight, sensors, measured, posed, gathered):
+    """½ Σ λ w ‖v‖²; a measured rotation is R_ig R_i R_ib⁻¹, skipped where `present` is 0."""
     cost = 0.0
-    for imu in range(imu_bone.size):
-        if not imu_weight[imu] > 0.0:
+    for imu in range(sensors.bone.size):
+        if not measured.present[imu] > 0.0:
             continue
-        bone = imu_bone[imu]
-        r = rotation[bone]
-        w, vx, vy, vz = relative_quaternion(r, imu_rotation[imu])
-        weighted = weight * imu_weight[imu]
+        bone = sensors.bone[imu]
+        r = posed.rotation[bone]
+        w, vx, vy, vz = relative_quaternion(r, measured.rotation[imu])
+        weighted = weight * measured.present[imu]
         cost += 0.5 * weighted * (vx * vx + vy * vy + vz * vz)
         n0 = r[0, 0] * vx + r[0, 1] * vy + r[0, 2] * vz
         n1 = r[1, 0] * vx + r[1, 1] * vy + r[1, 2] * vz
         n2 = r[2, 0] * vx + r[2, 1] * vy + r[2, 2] * vz
         quarter = 0.25 * weighted
-        information = information_out[bone]
+        information = gathered.information[bone]
         information[3, 3] += quarter * (1.0 - n0 * n0)
         information[4, 4] += quarter * (1.0 - n1 * n1)
         information[5, 5] += quarter * (1.0 - n2 * n2)
@@ -92,7 +84,7 @@ def add_orientation(
         information[4, 5] -= quarter * n1 * n2
         information[5, 4] -= quarter * n1 * n2
         slope = -0.5 * weighted * w
-        gradient_out[bone, 3] += slope * n0
-        gradient_out[bone, 4] += slope * n1
-        gradient_out[bone, 5] += slope * n2
+        gathered.gradient[bone, 3] += slope * n0
+        gathered.gradient[bone, 4] += slope * n1
+        gathered.gradient[bone, 5] += slope * n2
     return cost

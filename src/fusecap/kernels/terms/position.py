@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import math
 
+from numba import float64 as f8
+
+from fusecap.kernels.groups import GATHERED, LANDMARKS, POSED, SCRATCH
 from fusecap.kernels.information import add_point
 from fusecap.kernels.jit import FINITE, kernel
 from fusecap.kernels.projection import project_with_jacobian
@@ -13,38 +16,20 @@ UNSEEN_RESIDUAL_PX = 1920.0
 no gradient; were it free, a body could hide from its residuals behind the camera."""
 
 
-@kernel(
-    "f8(f8, i8[::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1], "
-    "f8[:, ::1], f8[::1], f8[:, :, ::1], f8[:, ::1])"
-)
-def add_position(
-    # Term in:
-    weight,
-    landmark_bone,
-    landmark_offset,
-    cameras,
-    keypoints,
-    # Body in:
-    position,
-    rotation,
-    # Scratch:
-    point_information,
-    point_gradient,
-    # Gathered out:
-    information_out,
-    gradient_out,
-):
+@kernel(f8(f8, LANDMARKS, f8[:, :, ::1], POSED, SCRATCH, GATHERED))
+def add_position(weight, landmarks, keypoints, posed, scratch, gathered):
     """½ Σ log(1 + λ w ‖project(x) - keypoint‖²), residuals in pixels of a 1920-pixel-wide image.
 
     keypoints (C, K, 3): x, y, confidence w; zero confidence or NaN means missing. The 3x3
     information of a landmark is summed over the cameras before it moves the bones.
     """
+    cameras, position, rotation = landmarks.cameras, posed.position, posed.rotation
     cost = 0.0
-    for landmark in range(landmark_bone.size):
-        bone = landmark_bone[landmark]
-        ox = landmark_offset[landmark, 0]
-        oy = landmark_offset[landmark, 1]
-        oz = landmark_offset[landmark, 2]
+    for landmark in range(landmarks.bone.size):
+        bone = landmarks.bone[landmark]
+        ox = landmarks.offset[landmark, 0]
+        oy = landmarks.offset[landmark, 1]
+        oz = landmarks.offset[landmark, 2]
         r = rotation[bone]
         x = position[bone, 0] + r[0, 0] * ox + r[0, 1] * oy + r[0, 2] * oz
         y = position[bone, 1] + r[1, 0] * ox + r[1, 1] * oy + r[1, 2] * oz
@@ -81,22 +66,22 @@ def add_position(
             g2 += weighted * (uz * du + vz * dv)
             seen = True
         if seen:
-            point_information[0, 0] = w00
-            point_information[0, 1] = point_information[1, 0] = w01
-            point_information[0, 2] = point_information[2, 0] = w02
-            point_information[1, 1] = w11
-            point_information[1, 2] = point_information[2, 1] = w12
-            point_information[2, 2] = w22
-            point_gradient[0] = g0
-            point_gradient[1] = g1
-            point_gradient[2] = g2
+            scratch.information[0, 0] = w00
+            scratch.information[0, 1] = scratch.information[1, 0] = w01
+            scratch.information[0, 2] = scratch.information[2, 0] = w02
+            scratch.information[1, 1] = w11
+            scratch.information[1, 2] = scratch.information[2, 1] = w12
+            scratch.information[2, 2] = w22
+            scratch.gradient[0] = g0
+            scratch.gradient[1] = g1
+            scratch.gradient[2] = g2
             add_point(
                 x - position[0, 0],
                 y - position[0, 1],
                 z - position[0, 2],
-                point_information,
-                point_gradient,
-                information_out[bone],
-                gradient_out[bone],
+                scratch.information,
+                scratch.gradient,
+                gathered.information[bone],
+                gathered.gradient[bone],
             )
     return cost
