@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from fusecap.errors import CalibrationError
+from fusecap.errors import CalibrationError, TakeError
 from fusecap.geometry.camera import Camera, Rig
 from fusecap.sources.calibration_files import load_rig, write_rig
 from session_files import ring
@@ -141,6 +141,6 @@ def test_camera_that_cannot_name_a_file_is_refused(tmp_path):
 
 def test_unwritable_place_says_so(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(CalibrationError, match="cannot write"):
+    with pytest.raises(TakeError, match="cannot write"):
         write_rig(tmp_path / "file" / "rig.toml", ring())
     assert [path.name for path in tmp_path.iterdir()] == ["file"]

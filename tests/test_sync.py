@@ -433,7 +433,7 @@ def test_command_finds_cameras_and_sensors_of_the_simulated_demo(tmp_path, monke
     )
     path.write_text(text.replace('imu_up = "y"', 'imu_up = "y"\noffset_s = -0.6'))
     arguments = ["calibrate", "sync", str(tmp_path), "--write", "--json", "--max-offset", "2"]
-    arguments += ["--plot", str(tmp_path / "sync.png")]
+    arguments += ["--picture", str(tmp_path / "sync.png")]
     monkeypatch.setattr("sys.argv", ["fusecap", *arguments])
     with pytest.raises(SystemExit) as ended:
         main()

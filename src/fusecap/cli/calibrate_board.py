@@ -43,7 +43,7 @@ def board(
     """Draw a calibration board in exact millimetres to print, and write its board file."""
     from fusecap.calibrate.cameras import board_drawing
     from fusecap.calibrate.cameras.board import CHARUCO, KINDS, Board
-    from fusecap.files import written_whole
+    from fusecap.files import write_whole
 
     check_choice("--kind", kind, KINDS)
     check_choice("the suffix of --out", out.suffix, (".pdf", ".png"))
@@ -69,12 +69,8 @@ def board(
         else board_drawing.draw_png(target, sheet, dpi=dpi)
     )
     toml = out.with_suffix(".toml")
-    for path, content in (
-        (out, drawing),
-        (toml, board_drawing.board_toml(target, out.name).encode()),
-    ):
-        with written_whole(path) as file:
-            file.write(content)
+    write_whole(out, drawing)
+    write_whole(toml, board_drawing.board_toml(target, out.name))
     page_mm = (sheet.width_mm, sheet.height_mm)
     if as_json:
         report = {

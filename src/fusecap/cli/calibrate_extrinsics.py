@@ -106,7 +106,7 @@ def extrinsics(
     from fusecap.calibrate.cameras.board import read_board
     from fusecap.calibrate.cameras.report import calibrate_rig
     from fusecap.calibrate.pictures import plot_rig
-    from fusecap.sources.calibration_files.writer import write_rig
+    from fusecap.sources.calibration_files.writer import check_rig_path, write_rig
 
     if not sources or board is None:
         raise typer.BadParameter(
@@ -117,6 +117,7 @@ def extrinsics(
         raise typer.BadParameter(
             "expected two cameras or more; one camera has only intrinsics", param_hint="SOURCES"
         )
+    check_rig_path(out)
     target = read_board(board)
     with progress(quiet=as_json) as show:
         lenses = None if intrinsics is None else _lenses(intrinsics, list(named))

@@ -22,7 +22,6 @@ def from_people(
     *,
     out: Path,
     refine: Sequence[str] = (),
-    picture: bool = True,
     as_json: bool = False,
 ) -> None:
     """Refine the session's cameras, report, and write them where held-out keypoints agree better.
@@ -34,20 +33,20 @@ def from_people(
 
     from fusecap.calibrate.cameras.people import refine_from_people
     from fusecap.calibrate.pictures import plot_people
-    from fusecap.sources.calibration_files.writer import write_rig
+    from fusecap.sources.calibration_files.writer import check_rig_path, write_rig
     from fusecap.sources.session import load_session
     from fusecap.sources.session_data import open_session
 
+    check_rig_path(out)
     with progress(quiet=as_json) as show:
         data = open_session(load_session(session), show)
         found = refine_from_people(data, refine=refine, progress=show)
     files: list[Path] = []
     if found.improved:
         files += write_rig(out, found.rig, notes=_origin(found, data.session.settings.name))
-    if picture:
-        image = out.with_suffix(".png")
-        plot_people(found, image)
-        files.append(image)
+    picture = out.with_suffix(".png")
+    plot_people(found, picture)
+    files.append(picture)
     if as_json:
         print_json(_as_json(found, files))
     else:

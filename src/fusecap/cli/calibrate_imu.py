@@ -53,6 +53,7 @@ def imu(
     Residuals are measured on stretches of time that were left out.
     """
     from fusecap.calibrate.imus import session as calibration
+    from fusecap.files import check_writable
     from fusecap.sources.session import load_session
     from fusecap.take import load_take
 
@@ -66,6 +67,7 @@ def imu(
         raise typer.BadParameter(
             "needs --take: cameras do not observe all axes", param_hint="--optical"
         )
+    check_writable(out)
     loaded = load_session(session)
     calibration.wearers(loaded)
     if source == "tpose":
@@ -277,13 +279,12 @@ def _print_tpose(found: list[tuple[CalibratedImu, TPose]]) -> None:
 
 
 def _write(imus: list[CalibratedImu], out: Path, origin: str) -> list[Path]:
-    from fusecap.files import written_whole
+    from fusecap.files import write_whole
     from fusecap.sources.imu_calibration_files import imu_calibration_toml
 
     if not imus:
         return []
-    with written_whole(out) as file:
-        file.write(imu_calibration_toml(imus, origin=origin).encode())
+    write_whole(out, imu_calibration_toml(imus, origin=origin))
     return [out]
 
 

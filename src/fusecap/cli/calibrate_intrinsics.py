@@ -67,11 +67,12 @@ def intrinsics(
     from fusecap.calibrate.cameras.intrinsics import MODELS, calibrate_intrinsics
     from fusecap.calibrate.pictures import plot_lenses
     from fusecap.geometry.camera import Rig
-    from fusecap.sources.calibration_files.writer import write_rig
+    from fusecap.sources.calibration_files.writer import check_rig_path, write_rig
 
     named = named_sources(sources)
     if model is not None:
         check_choice("--model", model, tuple(MODELS))
+    check_rig_path(out)
     target = read_board(board)
     with progress(quiet=as_json) as show:
         found = [

@@ -35,18 +35,18 @@ def offsets(
     from dataclasses import asdict
 
     from fusecap.calibrate.offsets import calibrate_session, origin
-    from fusecap.files import written_whole
+    from fusecap.files import check_writable, write_whole
     from fusecap.sources.offset_files import offsets_toml
     from fusecap.sources.session import load_session
     from fusecap.sources.session_data import open_session
     from fusecap.take import load_take
 
+    check_writable(out)
     take = load_take(truth) if truth else None
     with progress(quiet=as_json) as show:
         data = open_session(load_session(session), show)
         found = calibrate_session(data, take, per_subject=per_subject, progress=show)
-    with written_whole(out) as file:
-        file.write(offsets_toml(found.landmarks, origin=origin(found, truth)).encode())
+    write_whole(out, offsets_toml(found.landmarks, origin=origin(found, truth)))
     if as_json:
         report = asdict(found) | {
             "landmarks": found.landmarks.name,

@@ -26,8 +26,10 @@ def prior(
 
     from fusecap.body.prior import save_prior
     from fusecap.body.skeleton import skeleton_named
+    from fusecap.files import check_writable
     from fusecap.motion.train_prior import train_prior
 
+    check_writable(out)
     body = skeleton_named(skeleton)
     with progress(quiet=as_json) as show:
         trained, report = train_prior(

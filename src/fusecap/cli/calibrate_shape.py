@@ -38,11 +38,12 @@ def shape(
     from fusecap.batch.solve import SessionInstants
     from fusecap.calibrate.pictures import plot_bodies
     from fusecap.calibrate.shape import calibrate_shape, shape_toml
-    from fusecap.files import written_whole
+    from fusecap.files import check_writable, write_whole
     from fusecap.setup import setup_of
     from fusecap.sources.session import load_session
     from fusecap.sources.session_data import open_session
 
+    check_writable(out)
     with progress(quiet=as_json) as show:
         data = open_session(load_session(session), show)
         found = calibrate_shape(
@@ -54,8 +55,7 @@ def shape(
             progress=show,
         )
     origin = f"measured in '{data.session.settings.name}'"
-    with written_whole(out) as file:
-        file.write(shape_toml(found.bodies, origin=origin).encode())
+    write_whole(out, shape_toml(found.bodies, origin=origin))
     picture = out.with_suffix(".png")
     plot_bodies(found.bodies, picture)
     problems = _problems(found)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from fusecap.calibrate.sync.clock_rows import ClockRow
     from fusecap.calibrate.sync.session import Synchronisation
 
-EXAMPLE = "Example: fusecap calibrate sync recordings/duo --write --plot recordings/duo/sync.png"
+EXAMPLE = "Example: fusecap calibrate sync recordings/duo --write --picture recordings/duo/sync.png"
 
 
 def sync(
@@ -29,7 +29,7 @@ def sync(
     max_offset: Annotated[
         float, typer.Option(min=0.1, max=600.0, help="Largest offset looked for, in seconds.")
     ] = 10.0,
-    plot: Annotated[
+    picture: Annotated[
         Path | None, typer.Option(help="Draw curves and offsets (.png).", show_default=False)
     ] = None,
     as_json: Json = False,
@@ -41,7 +41,7 @@ def sync(
     from dataclasses import asdict
 
     from fusecap.calibrate.sync.session import synchronise
-    from fusecap.files import written_whole
+    from fusecap.files import check_writable, write_whole
     from fusecap.sources.session import missing_files, parse_session
     from fusecap.sources.sync_files import sync_toml
 
@@ -52,17 +52,19 @@ def sync(
     missing = [line for line in missing_files(opened) if not line.startswith(needed)]
     if missing:
         raise InputError("\n".join(f"{opened.path}: {line}" for line in missing))
-    with progress(quiet=as_json) as show:
-        found = synchronise(opened, max_offset_s=max_offset, progress=show)
     if write:
         out = opened.path.parent / "sync.toml"
-    if plot is not None:
+    for file in (out, picture):
+        if file is not None:
+            check_writable(file)
+    with progress(quiet=as_json) as show:
+        found = synchronise(opened, max_offset_s=max_offset, progress=show)
+    if picture is not None:
         from fusecap.calibrate.sync.plot import draw
 
-        draw(found, plot)
+        draw(found, picture)
     if out is not None:
-        with written_whole(out) as file:
-            file.write(sync_toml(found.clocks, origin=_origin(found)).encode())
+        write_whole(out, sync_toml(found.clocks, origin=_origin(found)))
     named = _name(opened.path) if write else False
     if as_json:
         print_json(
@@ -84,8 +86,8 @@ def sync(
             console.print(f"{opened.path.name} names it already", soft_wrap=True)
         if out is None and found.complete:
             console.print("nothing is changed yet: --write puts the clocks into the session")
-        if plot is not None:
-            console.print(f"wrote {plot}", soft_wrap=True)
+        if picture is not None:
+            console.print(f"wrote {picture}", soft_wrap=True)
     if not found.complete:
         raise typer.Exit(1)
 
@@ -101,7 +103,7 @@ def _name(path: Path) -> bool:
     import re
     import tomllib
 
-    from fusecap.files import written_whole
+    from fusecap.files import write_whole
 
     text = path.read_text(encoding="utf-8")
     if "sync" in tomllib.loads(text).get("session", {}):
@@ -109,8 +111,7 @@ def _name(path: Path) -> bool:
     changed = re.sub(
         r"^(\s*\[\s*session\s*\][^\n]*)$", r'\1\nsync = "sync.toml"', text, count=1, flags=re.M
     )
-    with written_whole(path) as file:
-        file.write(changed.encode())
+    write_whole(path, changed)
     return True
 
 

@@ -12,7 +12,7 @@ import typer
 
 from fusecap.calibrate.verdict import Verdict
 from fusecap.cli.common import console, err
-from fusecap.files import written_whole
+from fusecap.files import write_whole
 
 _COLOURS = {Verdict.GOOD: "green", Verdict.USABLE: "yellow", Verdict.POOR: "red"}
 
@@ -55,8 +55,7 @@ def named_sources(sources: list[str]) -> dict[str, str]:
 def write_report(out: Path, report: dict[str, Any]) -> Path:
     """The report beside the calibration, as `<name>_report.json`."""
     path = out.with_name(f"{out.stem}_report.json")
-    with written_whole(path) as file:
-        file.write(json.dumps(report, indent=2).encode())
+    write_whole(path, json.dumps(report, indent=2))
     return path
 
 

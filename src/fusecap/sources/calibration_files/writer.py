@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
 
 from fusecap.errors import CalibrationError
+from fusecap.files import check_writable, write_whole
 from fusecap.geometry.camera import Rig
 from fusecap.sources.calibration_files import aniposelib, panoptic, qualisys, shelf
 
@@ -23,15 +23,30 @@ def write_rig(path: Path | str, rig: Rig, *, notes: Sequence[str] = ()) -> list[
     Qualisys in millimetres, `.json` Panoptic in centimetres; a name without any of these is a
     folder with one JSON per camera in metres. `load_rig` reads all of them back. `notes` become
     comments in a TOML. Rotations that are not quite orthonormal become the nearest rotation in
-    a TOML and stay as they are in the others. Raises `CalibrationError`.
+    a TOML and stay as they are in the others. Raises `CalibrationError` or `TakeError`.
     """
     path = Path(path)
     if not len(rig):
         raise CalibrationError(f"{path}: a calibration without cameras is not written")
+    check_rig_path(path)
     texts = _texts(path, rig, notes)
     for file, text in texts.items():
-        _write_whole(file, text)
+        write_whole(file, text)
     return list(texts)
+
+
+def check_rig_path(path: Path) -> None:
+    """Before the work that finds the cameras: raises where `write_rig` could not write them."""
+    if path.name.endswith((".toml", ".json", ".qca.txt", ".qca")):
+        check_writable(path)
+    elif path.suffix or path.is_file():
+        raise CalibrationError(
+            f"{path}: no calibration format has this name; expected .toml (aniposelib, Pose2Sim, "
+            "FreeMoCap, caliscope), .qca.txt (Qualisys), .json (Panoptic), or a folder's name for "
+            "one JSON per camera"
+        )
+    else:
+        check_writable(path / "camera.json")
 
 
 def _texts(path: Path, rig: Rig, notes: Sequence[str]) -> dict[Path, str]:
@@ -43,12 +58,6 @@ def _texts(path: Path, rig: Rig, notes: Sequence[str]) -> dict[Path, str]:
         return {path: qualisys.dumps(cameras)}
     if path.suffix == ".json":
         return {path: panoptic.dumps(cameras)}
-    if path.suffix or path.is_file():
-        raise CalibrationError(
-            f"{path}: no calibration format has this name; expected .toml (aniposelib, Pose2Sim, "
-            "FreeMoCap, caliscope), .qca.txt (Qualisys), .json (Panoptic), or a folder's name for "
-            "one JSON per camera"
-        )
     for camera in cameras:
         if not _FILE_NAME.fullmatch(camera.name):
             raise CalibrationError(
@@ -61,18 +70,3 @@ def _texts(path: Path, rig: Rig, notes: Sequence[str]) -> dict[Path, str]:
             "be read with these; name another folder"
         )
     return {path / f"{camera.name}.json": shelf.dumps(camera) for camera in cameras}
-
-
-def _write_whole(path: Path, text: str) -> None:
-    """Whatever was at `path` stays until all is written."""
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            part.write_text(text, encoding="utf-8")
-            part.replace(path)
-        finally:
-            part.unlink(missing_ok=True)
-    except (OSError, UnicodeEncodeError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise CalibrationError(f"cannot write {path}: {reason}") from None
