@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 
-def from_wxyz(quaternion: ArrayLike) -> Rotation:
+def from_wxyz(quaternion: Float[np.ndarray, "*n 4"] | Sequence[float]) -> Rotation:
     """One rotation of `(4,)`, or many of `(n, 4)`, of any length but zero."""
     return Rotation.from_quat(np.roll(quaternion, -1, axis=-1))
 
