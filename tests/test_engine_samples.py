@@ -82,6 +82,14 @@ def test_a_gap_is_not_taken_for_the_period():
     assert samples.period_s(1910 * MS) == pytest.approx(0.01)
 
 
+def test_one_early_sample_does_not_make_the_period():
+    samples = Samples[int]()
+    for t in (0, 5, 20, 35):
+        samples.insert(t * MS, t)
+    assert samples.period_s(35 * MS) == pytest.approx(0.015)
+    assert samples.period_s(5 * MS) is None, "not enough samples yet"
+
+
 def test_camera_is_interpolated_on_the_instants_of_the_solve():
     detections = camera_at(0, 10, 20).detections(13 * MS)
     assert detections.people[0][0, 0, 0] == pytest.approx(13.0)
@@ -157,7 +165,8 @@ def test_sensors_know_when_a_sample_is_still_to_come():
     assert sensors.waiting(0) == []
     sensors.take(sample(10))
     assert sensors.waiting(10 * MS) == [False] and sensors.waiting(11 * MS) == [True]
-    assert sensors.waiting(2000 * MS) == []
+    assert sensors.waiting(60 * MS) == [True], "as long as it is fresh"
+    assert sensors.waiting(60 * MS + 1) == sensors.waiting(2000 * MS) == []
 
 
 def test_unusable_sensor_samples_are_left_out():
