@@ -36,10 +36,10 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+from live_faults import Fault, FaultKind, FaultyDetector, with_faults
 from live_scenes import AsPictures, SimulatedDetector, receivers, send_to, simulated_session
 
 from fusecap.engine.engine import LiveStep
-from fusecap.live.devices.faults import Fault, FaultKind, FaultyDetector, with_faults
 from fusecap.live.devices.playback_sources import PlaybackOptions, playback_sources
 from fusecap.live.devices.source import SessionClock
 from fusecap.live.recorder import Recorder

@@ -11,8 +11,8 @@ import numpy as np
 from fusecap.engine.engine import Engine, LiveStep
 from fusecap.evaluate.demo_scene import demo_scene
 from fusecap.evaluate.simulated_session import write_session
-from fusecap.recording import RecordingWriter
 from fusecap.recording.setup_json import setup_values
+from fusecap.recording.writer import RecordingWriter
 from fusecap.setup import SessionSetup
 from fusecap.sources.session import load_session
 from fusecap.sources.session_data import open_session

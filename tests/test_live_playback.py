@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from live_faults import Fault, FaultKind, FaultyDetector, FaultySource
 
 from fusecap.body.landmarks import LANDMARK_SETS
 from fusecap.errors import InputError, SessionError
-from fusecap.live.devices.faults import Fault, FaultKind, FaultyDetector, FaultySource
 from fusecap.live.devices.playback_sources import PlaybackOptions, Stall, playback_sources
 from fusecap.live.devices.source import Delivery, SessionClock, Source, SourceCounts, SourceLost
 from fusecap.sources.session import load_session

@@ -12,11 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fusecap.live.devices.source import SessionClock, SourceLost
-from fusecap.live.health import Input, Meter
+from fusecap.live.health import Incidents, Input, Meter
 from fusecap.live.inbox import Inbox
-from fusecap.live.incidents import Incidents
 from fusecap.live.latency import Arrivals, Histogram, LatencyBook
-from fusecap.live.record_switch import RecordSwitch
+from fusecap.live.recorder import RecordSwitch
 from fusecap.live.run import LiveOptions, LiveRun
 from fusecap.live.status import Light
 from fusecap.recording.reader import Recording

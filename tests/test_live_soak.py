@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from live_faults import Fault, with_faults
 
 from fusecap.engine.engine import Engine, LiveStep
-from fusecap.live.devices.faults import Fault, with_faults
 from fusecap.live.devices.playback_sources import PlaybackOptions, playback_sources
 from fusecap.live.devices.source import SessionClock, Source, SourceLost
 from fusecap.setup import session_setup

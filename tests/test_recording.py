@@ -29,9 +29,9 @@ from fusecap.body.landmarks import LANDMARK_SETS, LandmarkOffsets
 from fusecap.errors import InputError
 from fusecap.live.devices.source import SessionClock
 from fusecap.live.recorder import Recorder
-from fusecap.recording import RecordingWriter
 from fusecap.recording.reader import RecordedEvent, RecordedPose, Recording
 from fusecap.recording.setup_json import setup_from_values, setup_values
+from fusecap.recording.writer import RecordingWriter
 from fusecap.setup import SessionSetup
 from fusecap.sources.session import Session
 from fusecap.types import CameraImage, CameraSample, Command, CommandKind, ImuSample, Tick

@@ -18,7 +18,8 @@ from fusecap.body.shape import REFERENCE_HEIGHT_M, BodyShape
 from fusecap.engine.engine import Engine, LiveStep
 from fusecap.errors import InputError
 from fusecap.progress import Progress
-from fusecap.recording.reader import SUFFIX, RecordedBody, RecordedEvent, RecordedPose, Recording
+from fusecap.recording.layout import SUFFIX, RecordedBody
+from fusecap.recording.reader import RecordedEvent, RecordedPose, Recording
 from fusecap.recording.setup_json import setup_from_values
 from fusecap.setup import SessionSetup
 from fusecap.take import Take, TakeBuilder, load_take, provenance, take_from_theta

@@ -18,7 +18,7 @@ from fusecap.errors import InputError
 
 if TYPE_CHECKING:
     from fusecap.live.devices.playback_sources import PlaybackOptions, Stall
-    from fusecap.live.record_switch import RecordSwitch
+    from fusecap.live.recorder import RecordSwitch
     from fusecap.live.run import LiveRun
     from fusecap.live.streaming import Streaming
     from fusecap.sources.session import Session
@@ -106,14 +106,15 @@ def live(
     from fusecap.cli.live_status import LiveLine, print_report
     from fusecap.live.devices.source import SessionClock
     from fusecap.live.opening import check_live, open_setup, open_sources
-    from fusecap.live.record_switch import RecordSwitch
+    from fusecap.live.recorder import RecordSwitch
     from fusecap.live.run import LiveOptions, LiveRun
+    from fusecap.recording.layout import SUFFIX
     from fusecap.sources.session import load_session
 
     if no_record and (record is not None or record_images):
         raise InputError("--no-record says that nothing is recorded; leave it or --record out")
-    if record is not None and record.suffix != ".mcap":
-        raise InputError(f"--record {record}: a recording is one .mcap file")
+    if record is not None and record.suffix != SUFFIX:
+        raise InputError(f"--record {record}: a recording is one {SUFFIX} file")
     targets = placed_targets(to or [], host, other_servers=view)
     loaded = load_session(session)
     played = _playback(
@@ -209,9 +210,10 @@ def _add_streams(run: LiveRun, targets: Sequence[Target]) -> Streaming | None:
 def recording_path(session: Session) -> Path:
     """A name of its own for each recording, beside the session."""
     from fusecap.files import safe_name
+    from fusecap.recording.layout import SUFFIX
 
     now = datetime.now().strftime("%Y-%m-%d-%H%M%S")
-    return session.folder / f"{safe_name(session.settings.name)}-{now}.mcap"
+    return session.folder / f"{safe_name(session.settings.name)}-{now}{SUFFIX}"
 
 
 def _add_viewer(

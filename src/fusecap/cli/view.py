@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -57,7 +56,7 @@ def view(
 
     Nothing leaves this machine. Ctrl-C ends it.
     """
-    from fusecap.recording.reader import SUFFIX
+    from fusecap.recording.layout import SUFFIX
     from fusecap.sources.session import parse_session
     from fusecap.sources.session_data import open_rig
     from fusecap.take import load_take
@@ -117,7 +116,7 @@ def look(
         try:
             shown = TakePage(page, take, rig=rig, curves=curves, detections=detections)
             _announce(page, browser=browser, as_json=as_json)
-            shown.run(threading.Event())
+            shown.run()
         finally:
             page.stop()
 

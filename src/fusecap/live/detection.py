@@ -15,8 +15,7 @@ import numpy as np
 
 from fusecap.detect.detector import Detector
 from fusecap.live.devices.source import SessionClock
-from fusecap.live.health import Meter
-from fusecap.live.incidents import Incidents
+from fusecap.live.health import Incidents, Meter
 from fusecap.live.latency import CAMERA, DETECTION, WAIT_FOR_DETECTOR, LatencyBook
 from fusecap.types import CameraImage, CameraSample
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from fusecap.live.devices.source import Delivery, Source, SourceLost
-from fusecap.live.incidents import Incidents
+from fusecap.live.health import Incidents
 
 FIRST_PAUSE_S = 0.5
 LONGEST_PAUSE_S = 5.0

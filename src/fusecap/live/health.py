@@ -1,19 +1,22 @@
-"""Lights and rates: how each camera and sensor, and the process itself, is doing."""
+"""Lights, rates and incidents: how cameras, sensors and the process itself are doing."""
 
 from __future__ import annotations
 
 import os
+import threading
 import time
+from collections import deque
 from pathlib import Path
 
-from fusecap.live.devices.source import Delivery
-from fusecap.live.status import Light, SourceStatus
+from fusecap.live.devices.source import Delivery, SessionClock
+from fusecap.live.status import Incident, Light, SourceStatus
 from fusecap.setup import SessionSetup
 from fusecap.types import ImuSample
 
 LATE_S = 0.1
 LATE_PERIODS = 3
 LOST_S = 1.0
+INCIDENTS_KEPT = 500
 _BUCKETS = 8
 """Seconds that are kept."""
 _SECOND_NS = 1_000_000_000
@@ -124,6 +127,34 @@ def inputs_of(setup: SessionSetup) -> dict[Key, Input]:
         for imu in subject.imus:
             inputs[subject.name, imu.bone] = Input(f"{subject.name}/{imu.bone}", "imu")
     return inputs
+
+
+class Incidents:
+    """The first and the latest things that happened; written by any thread."""
+
+    def __init__(self, clock: SessionClock, kept: int = INCIDENTS_KEPT) -> None:
+        self.count = 0
+        """Of all, those forgotten included."""
+        self._clock = clock
+        self._first: list[Incident] = []
+        self._latest: deque[Incident] = deque(maxlen=kept // 2)
+        self._kept = kept
+        self._lock = threading.Lock()
+
+    def add(self, what: str) -> None:
+        """Something happened now."""
+        incident = Incident(time_s=1e-9 * self._clock.now_ns(), what=what)
+        with self._lock:
+            self.count += 1
+            if len(self._first) < self._kept - self._kept // 2:
+                self._first.append(incident)
+            else:
+                self._latest.append(incident)
+
+    def all(self) -> tuple[Incident, ...]:
+        """Those that are kept, oldest first."""
+        with self._lock:
+            return (*self._first, *self._latest)
 
 
 class ProcessLoad:

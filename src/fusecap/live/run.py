@@ -26,9 +26,8 @@ from fusecap.engine.engine import Engine, LiveStep
 from fusecap.live.detection import DetectionLoop
 from fusecap.live.devices.source import Delivery, SessionClock, Source
 from fusecap.live.feed import Feed
-from fusecap.live.health import Key, ProcessLoad, inputs_of, key_of
+from fusecap.live.health import Incidents, Key, ProcessLoad, inputs_of, key_of
 from fusecap.live.inbox import Inbox
-from fusecap.live.incidents import Incidents
 from fusecap.live.latency import CAMERA, SENSOR, LatencyBook
 from fusecap.live.report import LiveReport, subject_reports
 from fusecap.live.solving import LiveEngine, Solving

@@ -2,7 +2,3 @@
 
 docs/recording.md has the layout.
 """
-
-from fusecap.recording.writer import FORMAT, RecordingWriter
-
-__all__ = ["FORMAT", "RecordingWriter"]

@@ -12,7 +12,7 @@ import hashlib
 import json
 import struct
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -26,18 +26,14 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Message, Metadata, Schema
 
-from fusecap.body.shape import BodyShape
-from fusecap.body.skeleton import skeleton_named
 from fusecap.errors import InputError, MotionError
 from fusecap.progress import Progress
-from fusecap.types import CameraSample, Command, CommandKind, Event, ImuSample, Tick
+from fusecap.recording.layout import DECODERS, END, FORMAT, HEADER, Known, RecordedBody
+from fusecap.types import Event
 
-SUFFIX = ".mcap"
-FORMAT = "fusecap recording 1"
 MAX_BYTES = 256 << 20
 """Of one record, and of what a chunk unpacks to."""
 _MAGIC = b"\x89MCAP0\r\n"
-_HEADER, _END = "fusecap", "fusecap end"
 _RECORD = struct.Struct("<BQ")
 _BROKEN = (
     ValueError,
@@ -76,14 +72,6 @@ class RecordedPose:
     theta: Float[np.ndarray, " p"]
     bone_quality: Float[np.ndarray, " b"]
     diverged: bool
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RecordedBody:
-    """A person's body from now on."""
-
-    name: str
-    shape: BodyShape
 
 
 Item = RecordedEvent | RecordedPose | RecordedBody
@@ -133,7 +121,7 @@ class Recording:
                 raise ValueError("what the run knew fails its checksum")
             self.setup: Mapping[str, Any] = json.loads(header["setup"])
             """Plain values: what the run knew before the first event."""
-            self._known = _Known.of(self.setup)
+            self._known = Known.of(self.setup)
         except _BROKEN as error:
             raise InputError(f"{self.path}: its header is damaged ({error!r})") from None
 
@@ -156,7 +144,7 @@ class Recording:
                             schemas[record.id] = record.name
                         case Channel():
                             channels[record.id] = schemas.get(record.schema_id, "")
-                        case Metadata() if record.name == _END:
+                        case Metadata() if record.name == END:
                             loss.note = record.metadata.get("note", "")
                             events = record.metadata.get("events", "")
                             if events.isdecimal() and len(events) < 19:
@@ -173,7 +161,7 @@ class Recording:
             return hashlib.file_digest(file, "sha256").hexdigest()
 
     def _item(self, schema: str, message: Message, numbers: _Numbers) -> Item | None:
-        decode = _DECODERS.get(schema)
+        decode = DECODERS.get(schema)
         if decode is None:
             self.loss.malformed += not schema
             return None
@@ -200,7 +188,7 @@ class Recording:
                 for opcode, payload in self._records(file, Loss(), None):
                     if opcode == Opcode.METADATA:
                         record = Metadata.read(ReadDataStream(BytesIO(payload)))
-                        if record.name == _HEADER:
+                        if record.name == HEADER:
                             return record.metadata
                     if opcode == Opcode.CHUNK:
                         break
@@ -267,30 +255,6 @@ class _Numbers:
         return max(self._last, self._stated) - self._count
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Known:
-    """What samples must fit to."""
-
-    cameras: int
-    landmarks: int
-    sensors: frozenset[tuple[str, str]]
-    skeleton: str
-
-    @classmethod
-    def of(cls, setup: Mapping[str, Any]) -> _Known:
-        session = setup["session"]
-        return cls(
-            cameras=len(setup["rig"]),
-            landmarks=len(setup["landmarks"]["landmark_names"]),
-            sensors=frozenset(
-                (subject["name"], imu["bone"])
-                for subject in session.get("subject", ())
-                for imu in subject.get("imu", ())
-            ),
-            skeleton=session["session"].get("skeleton", "paper21"),
-        )
-
-
 def _inside(opcode: int, content: bytes) -> Iterator[_Record]:
     """The records of a chunk, or the record itself, as far as they matter here."""
     if opcode != Opcode.CHUNK:
@@ -331,84 +295,3 @@ def _unpacked(chunk: Chunk) -> bytes:
     if len(data) != size or chunk.uncompressed_crc not in (0, zlib.crc32(data)):
         raise ValueError("a chunk that fails its checksum")
     return data
-
-
-def _keypoints(values: Mapping[str, Any], known: _Known) -> CameraSample:
-    camera = _number(values["camera"])
-    if not 0 <= camera < known.cameras:
-        raise ValueError(f"no camera {camera}")
-    people = np.array(values["people"], dtype=np.float64)
-    if people.size == 0:
-        people = people.reshape(0, known.landmarks, 3)
-    if people.shape[1:] != (known.landmarks, 3):
-        raise ValueError(f"keypoints {people.shape}")
-    return CameraSample(camera=camera, timestamp_ns=_time_ns(values), people=people)
-
-
-def _imu(values: Mapping[str, Any], known: _Known) -> ImuSample:
-    subject, bone = values["subject"], values["bone"]
-    if (subject, bone) not in known.sensors:
-        raise ValueError(f"no sensor {subject}/{bone}")
-    return ImuSample(
-        subject=subject,
-        bone=bone,
-        timestamp_ns=_time_ns(values),
-        orientation_wxyz=_floats(values["orientation_wxyz"], 4),
-        accel_m_s2=_floats(values["accel_m_s2"], 3),
-    )
-
-
-def _command(values: Mapping[str, Any], known: _Known) -> Command:
-    return Command(kind=CommandKind(values["kind"]), subject=str(values["subject"]))
-
-
-def _tick(values: Mapping[str, Any], known: _Known) -> Tick:
-    return Tick(timestamp_ns=_time_ns(values))
-
-
-def _pose(values: Mapping[str, Any], known: _Known) -> dict[str, Any]:
-    skeleton = skeleton_named(known.skeleton)
-    return {
-        "name": str(values["name"]),
-        "timestamp_ns": _time_ns(values),
-        "theta": _floats(values["theta"], skeleton.pose_size),
-        "bone_quality": _floats(values["bone_quality"], skeleton.bone_count),
-        "diverged": values["status"] == "diverged",
-    }
-
-
-def _body(values: Mapping[str, Any], known: _Known) -> RecordedBody:
-    shape = BodyShape(
-        skeleton=skeleton_named(known.skeleton),
-        offsets_m=np.array(values["offsets_m"], dtype=np.float64),
-        height_m=float(values["height_m"]),
-    )
-    return RecordedBody(name=str(values["name"]), shape=shape)
-
-
-_DECODERS: dict[str, Callable[[Mapping[str, Any], _Known], Any]] = {
-    "fusecap.Keypoints": _keypoints,
-    "fusecap.Imu": _imu,
-    "fusecap.Command": _command,
-    "fusecap.Tick": _tick,
-    "fusecap.Pose": _pose,
-    "fusecap.Body": _body,
-}
-
-
-def _time_ns(values: Mapping[str, Any]) -> int:
-    return _number(values["timestamp_ns"])
-
-
-def _number(value: Any) -> int:
-    number = int(value)
-    if abs(number) >= 1 << 62:
-        raise ValueError(f"{number} is no time")
-    return number
-
-
-def _floats(values: Any, count: int) -> np.ndarray:
-    array = np.array(values, dtype=np.float64)
-    if array.shape != (count,):
-        raise ValueError(f"{array.shape} numbers, expected {count}")
-    return array

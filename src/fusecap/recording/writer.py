@@ -17,12 +17,10 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 
 from fusecap.body.shape import BodyShape
-from fusecap.recording import foxglove, messages
+from fusecap.recording import foxglove, layout
+from fusecap.recording.layout import END, FORMAT, HEADER
 from fusecap.types import CameraSample, Command, Estimate, Event, ImuSample, Tick
 
-FORMAT = "fusecap recording 1"
-HEADER, END = "fusecap", "fusecap end"
-"""Names of the metadata records before and after the data."""
 SCENE_PERIOD_NS = 100_000_000
 """Of the scene for Foxglove."""
 _SAME_BODY_M = 1e-4
@@ -70,18 +68,18 @@ class RecordingWriter:
         match event:
             case CameraSample():
                 topic = f"/camera/{self._cameras[event.camera]}/keypoints"
-                schema, text = "fusecap.Keypoints", messages.keypoints_message(event)
+                schema, text = layout.KEYPOINTS, layout.keypoints_message(event)
                 sample_ns = event.timestamp_ns
             case ImuSample():
                 topic = f"/imu/{event.subject}/{event.bone}"
-                schema, text = "fusecap.Imu", messages.imu_message(event)
+                schema, text = layout.IMU, layout.imu_message(event)
                 sample_ns = event.timestamp_ns
             case Tick():
-                topic, schema, text = "/tick", "fusecap.Tick", messages.tick_message(event)
+                topic, schema, text = "/tick", layout.TICK, layout.tick_message(event)
                 sample_ns = event.timestamp_ns
             case Command():
-                topic, schema = "/command", "fusecap.Command"
-                text = messages.command_message(event)
+                topic, schema = "/command", layout.COMMAND
+                text = layout.command_message(event)
         self.events += 1
         self._write(topic, schema, text, arrival_ns, sample_ns)
 
@@ -92,10 +90,10 @@ class RecordingWriter:
             name, at_ns = estimate.name, estimate.timestamp_ns
             if not _same_body(self._bodies.get(name), estimate.shape):
                 self._bodies[name] = estimate.shape
-                body = messages.body_message(name, estimate.shape)
-                self._write(f"/body/{name}", "fusecap.Body", body, now_ns, at_ns)
-            pose = messages.pose_message(estimate)
-            self._write(f"/pose/{name}", "fusecap.Pose", pose, now_ns, at_ns)
+                body = layout.body_message(name, estimate.shape)
+                self._write(f"/body/{name}", layout.BODY, body, now_ns, at_ns)
+            pose = layout.pose_message(estimate)
+            self._write(f"/pose/{name}", layout.POSE, pose, now_ns, at_ns)
         if estimates and (self._scene_due_ns is None or now_ns >= self._scene_due_ns):
             self._scene_due_ns = now_ns + SCENE_PERIOD_NS
             at_ns = estimates[0].timestamp_ns
@@ -134,7 +132,7 @@ class RecordingWriter:
 
     def _schema(self, name: str) -> int:
         if name not in self._schemas:
-            known = messages.SCHEMAS | foxglove.SCHEMAS
+            known = layout.SCHEMAS | foxglove.SCHEMAS
             self._schemas[name] = self._writer.register_schema(
                 name, "jsonschema", json.dumps(known[name]).encode()
             )

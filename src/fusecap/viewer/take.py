@@ -65,8 +65,9 @@ class TakePage:
         self._drawn: tuple[int, tuple[bool, ...]] | None = None
         self._draw(0, 0.0, plots=True)
 
-    def run(self, stopping: threading.Event) -> None:
-        """Plays until `stopping` is set; sends nothing while nobody looks."""
+    def run(self, stopping: threading.Event | None = None) -> None:
+        """Plays until `stopping` is set, or interrupted; sends nothing while nobody looks."""
+        stopping = stopping or threading.Event()
         controls = self._controls
         last_s = time.monotonic()
         plotted_s = 0.0

@@ -7,14 +7,14 @@ acceleration depends on the direction of time.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+import threading
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from fusecap.errors import InputError, SessionError
-from fusecap.live.devices.faults import Fault, FaultKind, with_faults
 from fusecap.live.devices.paced_sources import (
     HeldPictures,
     Keypoints,
@@ -23,12 +23,13 @@ from fusecap.live.devices.paced_sources import (
     Schedule,
     Sensors,
 )
-from fusecap.live.devices.source import SessionClock, Source
+from fusecap.live.devices.source import Deliver, Delivery, SessionClock, Source
 from fusecap.progress import Progress
 from fusecap.sources.keypoint_files import read_keypoints
 from fusecap.sources.session import CameraSettings, Session
 from fusecap.sources.session_data import common_landmarks, open_imus, session_clocks
 from fusecap.sources.video import Video
+from fusecap.types import ImuSample
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -91,32 +92,61 @@ def playback_sources(
     )
     for index, source in enumerate(sources):
         source.follow(schedule, seed=options.seed + index)
-    faults = _faults(options, session)
-    return with_faults(sources, faults, clock, options.seed) if faults else list(sources)
+    stalls = _stalls(options, session)
+    if not stalls and not options.loss:
+        return list(sources)
+    return [
+        _Interrupted(source, stalls, options.loss, clock, seed=options.seed + index)
+        for index, source in enumerate(sources)
+    ]
 
 
-def _faults(options: PlaybackOptions, session: Session) -> list[Fault]:
+class _Interrupted:
+    """A source that delivers what another does, but for stalls and losses on the way."""
+
+    def __init__(
+        self, source: Source, stalls: Sequence[Stall], loss: float, clock: SessionClock, seed: int
+    ) -> None:
+        self.name = source.name
+        self.counts = source.counts
+        self._source = source
+        self._stalls = tuple(stalls)
+        self._loss = loss
+        self._clock = clock
+        self._rng = np.random.default_rng(seed)
+
+    def run(self, deliver: Deliver, stopping: threading.Event) -> None:
+        """As the source does."""
+
+        def pass_on(item: Delivery) -> None:
+            if not self._stalled(item) and not (self._loss and self._rng.random() < self._loss):
+                deliver(item)
+
+        self._source.run(pass_on, stopping)
+
+    def _stalled(self, item: Delivery) -> bool:
+        names = [self.name]
+        if isinstance(item, ImuSample):
+            names.append(f"{item.subject}/{item.bone}")
+        since_s = self._clock.now_ns() * 1e-9
+        return any(
+            stall.source in names and 0 <= since_s - stall.start_s < stall.length_s
+            for stall in self._stalls
+        )
+
+
+def _stalls(options: PlaybackOptions, session: Session) -> list[Stall]:
+    """With the names that sources give themselves."""
     where = {camera.name: f"camera '{camera.name}'" for camera in session.cameras}
     for subject in session.subjects:
         where[subject.name] = f"imus of '{subject.name}'"
         where |= {sensor: sensor for sensor in (f"{subject.name}/{i.bone}" for i in subject.imus)}
-    faults = []
     for stall in options.stalls:
         if stall.source not in where:
             raise InputError(
                 f"no source '{stall.source}' to stall; expected one of {', '.join(where)}"
             )
-        faults.append(
-            Fault(
-                kind=FaultKind.STALL,
-                where=where[stall.source],
-                start_s=stall.start_s,
-                length_s=stall.length_s,
-            )
-        )
-    if options.loss:
-        faults.append(Fault(kind=FaultKind.LOSS, amount=options.loss))
-    return faults
+    return [replace(stall, source=where[stall.source]) for stall in options.stalls]
 
 
 def _check(options: PlaybackOptions) -> None:

@@ -1,8 +1,7 @@
 """What goes wrong with live inputs, on purpose: sources and detectors that fail on a schedule.
 
 A fault acts on one source (or all) from `start_s` for `length_s` of the run, seeded, so that a run
-with faults can be repeated. `fusecap live --playback` and the soak use them; real devices do all of
-this by themselves.
+with faults can be repeated. Real devices do all of this by themselves.
 """
 
 from __future__ import annotations

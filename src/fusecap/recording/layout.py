@@ -1,4 +1,6 @@
-"""One JSON message per sample, command, tick and pose, and the JSON schemas that describe them.
+"""What stands in a recording: its names, and per schema how a message is written and read.
+
+One JSON message per sample, command, tick and pose, described by a JSON schema.
 
 Numbers are written in the shortest form that reads back to the same bits; missing ones are null.
 Positions and rotations of poses follow from theta and are rounded to 1 um and 1e-7.
@@ -7,14 +9,57 @@ Positions and rotations of poses follow from theta and are rounded to 1 um and 1
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fusecap.body.shape import BodyShape
+from fusecap.body.skeleton import skeleton_named
 from fusecap.geometry.quaternions import to_wxyz
-from fusecap.types import CameraSample, Command, Estimate, ImuSample, Tick
+from fusecap.types import CameraSample, Command, CommandKind, Estimate, ImuSample, Tick
+
+SUFFIX = ".mcap"
+FORMAT = "fusecap recording 1"
+HEADER, END = "fusecap", "fusecap end"
+"""Names of the metadata records before and after the data."""
+KEYPOINTS, IMU = "fusecap.Keypoints", "fusecap.Imu"
+COMMAND, TICK = "fusecap.Command", "fusecap.Tick"
+POSE, BODY = "fusecap.Pose", "fusecap.Body"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordedBody:
+    """A person's body from now on."""
+
+    name: str
+    shape: BodyShape
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Known:
+    """What samples must fit to."""
+
+    cameras: int
+    landmarks: int
+    sensors: frozenset[tuple[str, str]]
+    skeleton: str
+
+    @classmethod
+    def of(cls, setup: Mapping[str, Any]) -> Known:
+        session = setup["session"]
+        return cls(
+            cameras=len(setup["rig"]),
+            landmarks=len(setup["landmarks"]["landmark_names"]),
+            sensors=frozenset(
+                (subject["name"], imu["bone"])
+                for subject in session.get("subject", ())
+                for imu in subject.get("imu", ())
+            ),
+            skeleton=session["session"].get("skeleton", "paper21"),
+        )
 
 
 def keypoints_message(sample: CameraSample) -> str:
@@ -93,14 +138,14 @@ SCHEMAS = {
     schema["title"]: schema
     for schema in (
         _object(
-            "fusecap.Keypoints",
+            KEYPOINTS,
             "Everyone the detector found in one picture of one camera.",
             camera={"type": "integer", "description": "In the order of the rig."},
             timestamp_ns=_TIME,
             people=_list(_list(_ROW, "x [px], y [px], confidence 0-1"), "Per person, per keypoint"),
         ),
         _object(
-            "fusecap.Imu",
+            IMU,
             "What one sensor measured at one moment.",
             subject=_TEXT,
             bone=_TEXT,
@@ -109,14 +154,14 @@ SCHEMAS = {
             accel_m_s2=_list(_NUMBER, "Specific force in the imu frame"),
         ),
         _object(
-            "fusecap.Command",
+            COMMAND,
             "A user's wish, in its place among the samples.",
             kind=_TEXT,
             subject=_TEXT,
         ),
-        _object("fusecap.Tick", "Solve this instant now.", timestamp_ns=_TIME),
+        _object(TICK, "Solve this instant now.", timestamp_ns=_TIME),
         _object(
-            "fusecap.Pose",
+            POSE,
             "One person as solved and sent; world right-handed, y up, floor y = 0.",
             name=_TEXT,
             track_id={"type": "integer"},
@@ -132,7 +177,7 @@ SCHEMAS = {
             rotation_wxyz=_list(_ROW, "Per bone, world_from_bone"),
         ),
         _object(
-            "fusecap.Body",
+            BODY,
             "A person's body from now on.",
             name=_TEXT,
             height_m=_NUMBER,
@@ -142,3 +187,85 @@ SCHEMAS = {
         ),
     )
 }
+
+
+def _keypoints(values: Mapping[str, Any], known: Known) -> CameraSample:
+    camera = _number(values["camera"])
+    if not 0 <= camera < known.cameras:
+        raise ValueError(f"no camera {camera}")
+    people = np.array(values["people"], dtype=np.float64)
+    if people.size == 0:
+        people = people.reshape(0, known.landmarks, 3)
+    if people.shape[1:] != (known.landmarks, 3):
+        raise ValueError(f"keypoints {people.shape}")
+    return CameraSample(camera=camera, timestamp_ns=_time_ns(values), people=people)
+
+
+def _imu(values: Mapping[str, Any], known: Known) -> ImuSample:
+    subject, bone = values["subject"], values["bone"]
+    if (subject, bone) not in known.sensors:
+        raise ValueError(f"no sensor {subject}/{bone}")
+    return ImuSample(
+        subject=subject,
+        bone=bone,
+        timestamp_ns=_time_ns(values),
+        orientation_wxyz=_floats(values["orientation_wxyz"], 4),
+        accel_m_s2=_floats(values["accel_m_s2"], 3),
+    )
+
+
+def _command(values: Mapping[str, Any], known: Known) -> Command:
+    return Command(kind=CommandKind(values["kind"]), subject=str(values["subject"]))
+
+
+def _tick(values: Mapping[str, Any], known: Known) -> Tick:
+    return Tick(timestamp_ns=_time_ns(values))
+
+
+def _pose(values: Mapping[str, Any], known: Known) -> dict[str, Any]:
+    skeleton = skeleton_named(known.skeleton)
+    return {
+        "name": str(values["name"]),
+        "timestamp_ns": _time_ns(values),
+        "theta": _floats(values["theta"], skeleton.pose_size),
+        "bone_quality": _floats(values["bone_quality"], skeleton.bone_count),
+        "diverged": values["status"] == "diverged",
+    }
+
+
+def _body(values: Mapping[str, Any], known: Known) -> RecordedBody:
+    shape = BodyShape(
+        skeleton=skeleton_named(known.skeleton),
+        offsets_m=np.array(values["offsets_m"], dtype=np.float64),
+        height_m=float(values["height_m"]),
+    )
+    return RecordedBody(name=str(values["name"]), shape=shape)
+
+
+DECODERS: dict[str, Callable[[Mapping[str, Any], Known], Any]] = {
+    KEYPOINTS: _keypoints,
+    IMU: _imu,
+    COMMAND: _command,
+    TICK: _tick,
+    POSE: _pose,
+    BODY: _body,
+}
+"""Of a schema: from its values and what they must fit to; raises where they do not."""
+
+
+def _time_ns(values: Mapping[str, Any]) -> int:
+    return _number(values["timestamp_ns"])
+
+
+def _number(value: Any) -> int:
+    number = int(value)
+    if abs(number) >= 1 << 62:
+        raise ValueError(f"{number} is no time")
+    return number
+
+
+def _floats(values: Any, count: int) -> np.ndarray:
+    array = np.array(values, dtype=np.float64)
+    if array.shape != (count,):
+        raise ValueError(f"{array.shape} numbers, expected {count}")
+    return array
