@@ -1,16 +1,24 @@
+import sys
 from dataclasses import replace
+from types import ModuleType
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
 
 from bvh_reader import Bvh
 from fusecap.body.shape import end_offsets_m
 from fusecap.body.skeleton import EXTENDED23, PAPER21
+from fusecap.cli import app
+from fusecap.cli.common import write_take
 from fusecap.errors import InputError, TakeError
-from fusecap.export.bvh import euler_zxy_rad, export_bvh, write_bvh
+from fusecap.export.formats import FORMATS
+from fusecap.export.formats.bvh import euler_zxy_rad, write_bvh
+from fusecap.export.take_files import TakeFormat, export_take
+from fusecap.take import save_take
 from motions import any_poses, person, take_of, walk
 
 
@@ -33,7 +41,9 @@ def from_zxy(angles_rad) -> np.ndarray:
 def test_every_joint_of_every_frame_reads_back(tmp_path, rng, skeleton, unit, unit_m):
     theta = np.stack([any_poses(rng, skeleton, 40), walk(person(skeleton=skeleton), 40)])
     take = take_of(theta, [person(1.5, skeleton), person(1.9, skeleton)], names=("a", "b"))
-    for subject, path in enumerate(export_bvh(take, tmp_path, stem="take", unit=unit)):
+    for subject, path in enumerate(
+        export_take(take, tmp_path, format="bvh", stem="take", unit=unit)
+    ):
         assert largest_error_m(path, take, subject, unit_m) < 1e-5
 
 
@@ -113,14 +123,14 @@ def test_subject_never_tracked_is_refused_alone_and_skipped_among_others(tmp_pat
     take = with_gap(take, [0, 1, 2])
     with pytest.raises(TakeError, match="'a' is tracked in no frame"):
         write_bvh(take, "a", tmp_path / "a.bvh")
-    assert [p.name for p in export_bvh(take, tmp_path, stem="t")] == ["t_b.bvh"]
+    assert [p.name for p in export_take(take, tmp_path, format="bvh", stem="t")] == ["t_b.bvh"]
     assert [p.name for p in tmp_path.iterdir()] == ["t_b.bvh"]
 
 
 def test_odd_names_become_file_names_that_stay_apart(tmp_path):
     names = ("../../etc/x", "a/b", "a:b", " ", "Zoë")
     take = take_of(np.stack([walk(person(), 1)] * 5), [person()] * 5, names=names)
-    paths = export_bvh(take, tmp_path / "out", stem="my take")
+    paths = export_take(take, tmp_path / "out", format="bvh", stem="my take")
     assert [p.parent for p in paths] == [tmp_path / "out"] * 5
     assert [p.name for p in paths] == [
         "my_take_______etc_x.bvh",
@@ -134,4 +144,31 @@ def test_odd_names_become_file_names_that_stay_apart(tmp_path):
 def test_unknown_unit_is_refused(tmp_path):
     take = take_of(walk(person(), 1)[None], [person()], names=("a",))
     with pytest.raises(InputError, match=r"known: m, cm|did you mean"):
-        write_bvh(take, "a", tmp_path / "a.bvh", unit="inch")
+        export_take(take, tmp_path, format="bvh", stem="a", unit="inch")
+
+
+def test_unknown_format_names_the_nearest_known_one(tmp_path):
+    take = take_of(walk(person(), 1)[None], [person()], names=("a",))
+    with pytest.raises(InputError, match="did you mean 'bvh'"):
+        export_take(take, tmp_path, format="bhv", stem="a")
+
+
+def test_the_format_asked_for_is_the_one_written(tmp_path, monkeypatch):
+    """`--format` and `--export` go by the table, and a new entry of it is all they need."""
+
+    def write(take, subject, path, *, units_per_m=1.0):
+        path.write_text(f"{subject} {units_per_m:g}")
+
+    module = ModuleType("fusecap.export.formats.note")
+    module.FORMAT = TakeFormat(suffix=".note", write=write)
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.setitem(FORMATS, "note", "a note")
+    take = take_of(walk(person(), 1)[None], [person()], names=("a",))
+    save_take(take, tmp_path / "t.npz")
+    command = ["export", str(tmp_path / "t.npz"), "--format", "note", "--unit", "cm"]
+    assert CliRunner().invoke(app, command).exit_code == 0
+    assert (tmp_path / "t_a.note").read_text() == "a 100"
+    assert not list(tmp_path.glob("*.bvh"))
+    again = tmp_path / "again.npz"
+    files = write_take(take, again, exports=["note", "bvh"], unit="m", picture=False)
+    assert [path.name for path in files] == ["again.npz", "again_a.note", "again_a.bvh"]

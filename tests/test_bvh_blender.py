@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from fusecap.body.skeleton import EXTENDED23, PAPER21
-from fusecap.export.bvh import export_bvh
+from fusecap.export.take_files import export_take
 from motions import any_poses, person, take_of, walk
 
 SCRIPT = Path(__file__).parent / "blender" / "check_bvh.py"
@@ -34,7 +34,7 @@ def test_blender_puts_every_joint_where_the_take_has_it(tmp_path, rng, bpy_pytho
     theta = np.stack([any_poses(rng, skeleton, 200), walk(shapes[1], 200)])
     take = take_of(theta, shapes, names=("anna", "ben"))
     expected = {}
-    for subject, path in enumerate(export_bvh(take, tmp_path, stem="take")):
+    for subject, path in enumerate(export_take(take, tmp_path, format="bvh", stem="take")):
         expected[f"path_{subject}"] = str(path)
         expected[f"bones_{subject}"] = np.array(take.bone_names)
         expected[f"position_m_{subject}"] = take.bone_position_in_world_m[subject]

@@ -20,10 +20,9 @@ if TYPE_CHECKING:
 
 err = Console(stderr=True, highlight=False, emoji=False)
 console = Console(highlight=False, emoji=False)
-EXPORTS = ("bvh",)
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object for machines.")]
-Unit = Annotated[str, typer.Option(help="Length unit of BVH: m (Blender) or cm (engines).")]
+Unit = Annotated[str, typer.Option(help="Length unit of exports: m (Blender) or cm (engines).")]
 SessionPath = Annotated[
     Path, typer.Argument(help="session.toml, or the folder that holds it.", show_default=False)
 ]
@@ -79,13 +78,13 @@ def progress(*, quiet: bool, rate: bool = False) -> Iterator[Progress]:
 def write_take(
     take: Take, path: Path, *, exports: list[str], unit: str, picture: bool
 ) -> list[Path]:
-    from fusecap.export.bvh import export_bvh
+    from fusecap.export.take_files import export_take
     from fusecap.take import save_take
 
     save_take(take, path)
     files = [path]
-    if "bvh" in exports:
-        files += export_bvh(take, path.parent, stem=path.stem, unit=unit)
+    for format in exports:
+        files += export_take(take, path.parent, format=format, stem=path.stem, unit=unit)
     frames = len(take.timestamps_ns)
     if picture and frames:
         from fusecap.export.plot import plot_take

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from fusecap.cli.common import (
-    EXPORTS,
     Json,
     Unit,
     check_choice,
@@ -21,6 +20,7 @@ from fusecap.cli.common import (
     write_take,
 )
 from fusecap.errors import InputError
+from fusecap.export.formats import FORMATS
 
 if TYPE_CHECKING:
     from fusecap.batch.solve import Solved, SolveReport
@@ -46,7 +46,7 @@ def solve(
         ),
     ] = None,
     export: Annotated[
-        str | None, typer.Option(help="Other formats beside the take, e.g. bvh.")
+        str | None, typer.Option(help=f"Other formats beside the take: {', '.join(FORMATS)}.")
     ] = None,
     unit: Unit = "m",
     picture: Annotated[bool, typer.Option("--picture", help="Also draw the motion.")] = False,
@@ -157,9 +157,9 @@ def _nobody(report: SolveReport) -> str:
 
 def _formats(text: str | None) -> list[str]:
     """The names of a comma-separated list, each checked."""
-    formats = [part.strip() for part in (text or "").split(",") if part.strip()]
+    formats = list(dict.fromkeys(p.strip() for p in (text or "").split(",") if p.strip()))
     for name in formats:
-        check_choice("--export", name, EXPORTS)
+        check_choice("--export", name, tuple(FORMATS))
     return formats
 
 

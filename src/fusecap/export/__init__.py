@@ -1,1 +1,1 @@
-"""Takes as files of other programs, one format per file."""
+"""Takes as files of other programs (`formats/`), keypoints as files, pictures and overlays."""

@@ -19,54 +19,34 @@ from jaxtyping import Float
 
 from fusecap.body.shape import BodyShape, end_offsets_m
 from fusecap.body.skeleton import Skeleton
-from fusecap.errors import InputError, TakeError, nearest
-from fusecap.files import safe_name, written_whole
+from fusecap.errors import TakeError
+from fusecap.export.take_files import TakeFormat
+from fusecap.files import written_whole
 from fusecap.take import Take
 
-UNITS_PER_M = {"m": 1.0, "cm": 100.0}
-"""Blender wants metres, game engines centimetres."""
 
-
-def export_bvh(take: Take, folder: Path | str, *, stem: str, unit: str = "m") -> list[Path]:
-    """One `<stem>_<subject>.bvh` for every subject that was tracked at all; returns the paths."""
-    paths: list[Path] = []
-    for subject, name in enumerate(take.subject_names):
-        if not take.tracked[subject].any():
-            continue
-        base = f"{safe_name(stem)}_{safe_name(name)}"
-        path = Path(folder) / f"{base}.bvh"
-        if path in paths:
-            path = path.with_name(f"{base}_{subject + 1}.bvh")
-        write_bvh(take, name, path, unit=unit)
-        paths.append(path)
-    return paths
-
-
-def write_bvh(take: Take, subject: str, path: Path | str, *, unit: str = "m") -> None:
+def write_bvh(take: Take, subject: str, path: Path, *, units_per_m: float = 1.0) -> None:
     """Write one subject's motion, whole or not at all.
 
     A frame where the subject is not tracked holds the pose before it, and one before the first
     tracked frame that one's. Raises `TakeError` for a subject that is never tracked.
     """
-    if unit not in UNITS_PER_M:
-        raise InputError(f"BVH in '{unit}': no such unit{nearest(unit, UNITS_PER_M)}")
     index = take.subject(subject)
     frames = _held_frames(take, index)
-    scale = UNITS_PER_M[unit]
     lines = [
-        *_hierarchy(take.shape(index), scale),
+        *_hierarchy(take.shape(index), units_per_m),
         "MOTION",
         f"Frames: {len(frames)}",
         f"Frame Time: {1 / take.rate_hz:.7f}",
     ]
     channels = np.concatenate(
         [
-            take.bone_position_in_world_m[index, frames, 0] * scale,
+            take.bone_position_in_world_m[index, frames, 0] * units_per_m,
             _angles_deg(take, index, frames),
         ],
         axis=1,
     )
-    with written_whole(Path(path)) as file:
+    with written_whole(path) as file:
         file.write(("\n".join(lines) + "\n").encode("ascii"))
         np.savetxt(file, channels, fmt="%.6f")
 
@@ -143,3 +123,6 @@ def _hierarchy(shape: BodyShape, scale: float) -> list[str]:
 
 def _vector(xyz: np.ndarray) -> str:
     return " ".join(f"{value:.6f}" for value in xyz)
+
+
+FORMAT = TakeFormat(suffix=".bvh", write=write_bvh)

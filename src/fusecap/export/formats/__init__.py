@@ -1,0 +1,22 @@
+"""The table of formats that a take is exported to, one module each with its `FORMAT`.
+
+A module is imported when its format is asked for, so that the table itself costs nothing.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from fusecap.export.take_files import TakeFormat
+
+FORMATS = {
+    "bvh": "a skeleton and its rotations, for Blender, Unity, Unreal, MotionBuilder",
+}
+"""What each is, by its name and that of its module."""
+
+
+def format_named(name: str) -> TakeFormat:
+    """One of `FORMATS`."""
+    return import_module(f"{__name__}.{name}").FORMAT
