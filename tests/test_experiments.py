@@ -21,7 +21,6 @@ from fusecap.evaluate.cells import (
     TwinCell,
     below_floor,
     mean_offsets,
-    plain,
     simulation_of,
 )
 from fusecap.evaluate.experiments import table3
@@ -37,6 +36,7 @@ from fusecap.evaluate.experiments.run import (
 from fusecap.evaluate.runner import Outcome
 from fusecap.evaluate.tables import Table
 from fusecap.evaluate.twin import TWIN_VERSION, twin_sequences, twin_simulation
+from fusecap.files import plain
 from motions import person, take_of, walk
 
 

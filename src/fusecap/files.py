@@ -1,12 +1,16 @@
-"""Writing files whole or not at all."""
+"""Writing files whole or not at all, and what JSON can hold."""
 
 from __future__ import annotations
 
 import contextlib
+import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+import numpy as np
 
 from fusecap.errors import TakeError
 
@@ -66,3 +70,19 @@ def safe_name(name: str) -> str:
     """`name` as part of a file name on any system: odd characters become underscores."""
     kept = "".join(c if c.isalnum() or c in "-_" else "_" for c in name.strip())
     return kept[:64] or "unnamed"
+
+
+def plain(value: Any) -> Any:
+    """For JSON: arrays as lists, enums by value, numbers that are not finite as null."""
+    match value:
+        case Mapping():
+            return {str(key): plain(item) for key, item in value.items()}
+        case list() | tuple():
+            return [plain(item) for item in value]
+        case np.ndarray() | np.generic():
+            return plain(value.tolist())
+        case Enum():
+            return value.value
+        case float() if not math.isfinite(value):
+            return None
+    return value

@@ -22,7 +22,7 @@ import time
 from collections import deque
 from collections.abc import Generator, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -33,7 +33,7 @@ from fusecap.body.landmarks import LandmarkSet
 from fusecap.detect.detector import Detector, DetectorOptions
 from fusecap.errors import InputError, SessionError
 from fusecap.export import openpose
-from fusecap.files import safe_name
+from fusecap.files import plain, safe_name
 from fusecap.pipeline import Pipeline
 from fusecap.progress import Progress
 from fusecap.setup import Setup, setup_of
@@ -103,27 +103,7 @@ class Detected:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values; NaN becomes None."""
-        cameras = {
-            name: {
-                "frames": camera.frames,
-                "frames_in_video": camera.frames_in_video,
-                "people_per_frame": _number(camera.people_per_frame),
-                "frames_with_people": _number(camera.frames_with_people),
-                "mean_confidence": _number(camera.mean_confidence),
-                "folder": camera.folder,
-            }
-            for name, camera in self.cameras.items()
-        }
-        return {
-            "detector": self.detector,
-            "landmark_set": self.landmark_set,
-            "cameras": cameras,
-            "frames_detected": self.frames_detected,
-            "frames_per_s": _number(self.frames_per_s),
-            "elapsed_s": self.elapsed_s,
-            "interrupted": self.interrupted,
-            "notes": list(self.notes),
-        }
+        return plain(asdict(self))
 
 
 def detector_options(
@@ -428,7 +408,3 @@ class _Work:
             mean_confidence=float(found.mean()) if found.size else float("nan"),
             folder=str(self.camera.folder),
         )
-
-
-def _number(value: float) -> float | None:
-    return value if np.isfinite(value) else None

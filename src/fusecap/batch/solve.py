@@ -19,6 +19,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from fusecap.body.shape import BodyShape
+from fusecap.files import plain
 from fusecap.pipeline import Pipeline, observation_of
 from fusecap.progress import Progress
 from fusecap.setup import Setup, setup_of
@@ -84,7 +85,7 @@ class SolveReport:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values; NaN becomes None."""
-        return _without_nan(asdict(self))
+        return plain(asdict(self))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -263,13 +264,3 @@ def _describe(take: Take, subject: int) -> dict[str, float]:
         "mean_quality": float(quality.mean()) if quality.size else 0.0,
         "height_m": float(take.heights_m[subject]),
     }
-
-
-def _without_nan(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _without_nan(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_without_nan(item) for item in value]
-    if isinstance(value, float) and not np.isfinite(value):
-        return None
-    return value

@@ -11,7 +11,6 @@ from fusecap.cli import calibrate_from_people
 from fusecap.cli.calibrate_intrinsics import Every
 from fusecap.cli.calibrations import (
     named_sources,
-    plain,
     print_files,
     print_verdict,
     write_report,
@@ -147,14 +146,11 @@ def extrinsics(
     plot_rig(result, found, picture)
     from dataclasses import asdict
 
-    as_dict = plain(
-        asdict(report)
-        | {
-            "board": target.words,
-            "intrinsics_refined": moving,
-            "centres_in_world_m": {c.name: c.position_in_world for c in rig.cameras},
-        }
-    )
+    as_dict = asdict(report) | {
+        "board": target.words,
+        "intrinsics_refined": moving,
+        "centres_in_world_m": {c.name: c.position_in_world for c in rig.cameras},
+    }
     files += [picture, write_report(out, as_dict)]
     if as_json:
         print_json(as_dict | {"files": [str(file) for file in files]})

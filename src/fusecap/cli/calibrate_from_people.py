@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from fusecap.cli.calibrations import plain, print_files, print_verdict
+from fusecap.cli.calibrations import print_files, print_verdict
 from fusecap.cli.common import check_choice, console, print_json, progress
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ def _as_json(found: PeopleCalibration, files: Sequence[Path]) -> dict[str, objec
 
     report = asdict(replace(found, rig=Rig(cameras=()), residuals_px={}))
     del report["rig"], report["residuals_px"]
-    return plain(report) | {"verdict": found.verdict, "files": [str(path) for path in files]}
+    return report | {"verdict": found.verdict, "files": [str(path) for path in files]}
 
 
 def _change(before: float, after: float) -> str:

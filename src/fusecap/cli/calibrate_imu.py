@@ -238,7 +238,7 @@ def _report_tpose(found: list[tuple[CalibratedImu, TPose]], out: Path, as_json: 
                 "bone_from_imu_wxyz": imu.bone_from_imu_wxyz,
                 "heading_deg": imu.heading_deg,
                 "moved_deg": pose.moved_deg,
-                "gravity_deg": None if pose.gravity_deg != pose.gravity_deg else pose.gravity_deg,
+                "gravity_deg": pose.gravity_deg,
                 "complaints": pose.complaints,
             }
             for imu, pose in found

@@ -9,7 +9,6 @@ import typer
 
 from fusecap.cli.calibrations import (
     named_sources,
-    plain,
     print_files,
     print_verdict,
     write_report,
@@ -116,7 +115,7 @@ def lens_report(lens: Intrinsics) -> dict[str, Any]:
     }
     fields = asdict(lens)
     del fields["camera"]
-    return plain(report | fields)
+    return report | fields
 
 
 def _print(lenses: list[Intrinsics]) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +9,7 @@ from typing import Any
 import typer
 
 from fusecap.calibrate.verdict import Verdict
-from fusecap.cli.common import console, err
+from fusecap.cli.common import console, err, json_text
 from fusecap.files import write_whole
 
 _COLOURS = {Verdict.GOOD: "green", Verdict.USABLE: "yellow", Verdict.POOR: "red"}
@@ -55,16 +53,5 @@ def named_sources(sources: list[str]) -> dict[str, str]:
 def write_report(out: Path, report: dict[str, Any]) -> Path:
     """The report beside the calibration, as `<name>_report.json`."""
     path = out.with_name(f"{out.stem}_report.json")
-    write_whole(path, json.dumps(report, indent=2))
+    write_whole(path, json_text(report))
     return path
-
-
-def plain(value: Any) -> Any:
-    """For JSON: arrays as lists, numbers that are not finite as null."""
-    if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if hasattr(value, "tolist"):
-        return plain(value.tolist())
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -12,6 +12,7 @@ import typer
 from rich.console import Console
 
 from fusecap.errors import nearest
+from fusecap.files import plain
 
 if TYPE_CHECKING:
     from fusecap.batch.solve import Solved
@@ -114,5 +115,10 @@ def print_speed(solved: Solved) -> None:
     )
 
 
+def json_text(value: dict[str, Any]) -> str:
+    """What `--json` prints and report files hold."""
+    return json.dumps(plain(value), indent=2)
+
+
 def print_json(value: dict[str, Any]) -> None:
-    typer.echo(json.dumps(value, indent=2))
+    typer.echo(json_text(value))

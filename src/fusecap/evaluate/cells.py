@@ -22,6 +22,7 @@ from fusecap.evaluate.twin import (
     twin_sequence,
     twin_simulation,
 )
+from fusecap.files import plain
 from fusecap.solve.options import SolverOptions, Weights
 from fusecap.take import Take
 
@@ -168,16 +169,3 @@ def _over_17_joints(take: Take, truth: Take) -> dict[str, float]:
         "position_mm": summarize(position_error_m(estimate, true)).mean * 1e3,
         "aligned_mm": summarize(aligned_error_m(estimate, true)).mean * 1e3,
     }
-
-
-def plain(value: Any) -> Any:
-    """For JSON: what is not a number becomes None, NumPy's numbers Python's."""
-    if isinstance(value, Mapping):
-        return {key: plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

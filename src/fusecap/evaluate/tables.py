@@ -9,6 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from fusecap.files import plain
+
 Value = str | float | int | None
 """None and NaN are shown as a dash."""
 
@@ -56,7 +58,7 @@ class Table:
             "title": self.title,
             "note": self.note,
             "columns": list(self.columns),
-            "rows": [[None if _missing(value) else value for value in row] for row in self.rows],
+            "rows": plain(self.rows),
         }
 
     def shown(self, value: Value) -> str:

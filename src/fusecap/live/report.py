@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from fusecap.files import plain
 from fusecap.live.feed import FeedReport
 from fusecap.live.solving import PersonTally
 from fusecap.live.status import (
@@ -79,9 +79,7 @@ class LiveReport:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values; what is not finite becomes None."""
-        plain = _plain(asdict(self))
-        assert isinstance(plain, dict)
-        return {"cores": os.cpu_count(), **plain}
+        return {"cores": os.cpu_count(), **plain(asdict(self))}
 
 
 def subject_reports(people: Mapping[str, PersonTally], instants: int) -> dict[str, SubjectReport]:
@@ -94,13 +92,3 @@ def subject_reports(people: Mapping[str, PersonTally], instants: int) -> dict[st
         )
         for name, tally in people.items()
     }
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _plain(held) for key, held in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(held) for held in value]
-    if isinstance(value, float):
-        return round(value, 6) if math.isfinite(value) else None
-    return getattr(value, "value", value)

@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from fusecap.evaluate.cells import plain, solve_cell
+from fusecap.evaluate.cells import solve_cell
 from fusecap.evaluate.experiments.bars import bars
 from fusecap.evaluate.experiments.experiment import Experiment, Finding, Report, Results, Settings
 from fusecap.evaluate.experiments.figure7 import FIGURE7
@@ -23,7 +23,7 @@ from fusecap.evaluate.experiments.table4 import TABLE4
 from fusecap.evaluate.experiments.tuning import TUNING
 from fusecap.evaluate.runner import OnOutcome, Outcome, code_version, run_cells
 from fusecap.evaluate.twin import TWIN_VERSION
-from fusecap.files import written_whole
+from fusecap.files import plain, written_whole
 
 EXPERIMENTS = {
     each.name: each
