@@ -406,6 +406,7 @@ def test_algorithm_1_sorts_two_who_keep_apart(rng):
     history, score = run(PaperSorter(rig, BODY25, [ann, bob]), scene)
     assert score.person_of == {0: 0, 1: 1}
     assert score.switches == 0 and score.wrong <= 0.01 * score.assigned
+    assert score.seen_share > 0.9
     assert [u.name for u in history[0]] == ["ann", "bob"]
 
 
@@ -427,3 +428,13 @@ def test_algorithm_1_gives_nothing_when_the_closest_is_used(rng):
     subjects = [Subject(name="ann", start_m=(0.1, 0.0)), Subject(name="bob", start_m=(0.4, 0.0))]
     updates = PaperSorter(rig, BODY25, subjects).update(scene.detections[0], {}, 0)
     assert [u.name for u in updates] == ["ann"]
+
+
+def test_algorithm_1_coasts_while_nobody_is_seen(rng):
+    rig = ring_of_cameras(4)
+    sorter = PaperSorter(rig, BODY25, [Subject(name="ann", start_m=(-3.0, 0.75))])
+    scene = observe(rig, two_who_pass(1.5), rng)
+    sorter.update(scene.detections[0], {}, 0)
+    nobody = Detections(timestamp_ns=1, people=(np.zeros((0, 25, 3)),) * 4)
+    (update,) = sorter.update(nobody, {}, 1)
+    assert update.state is TrackState.COASTING and np.all(update.person == -1)

@@ -16,6 +16,10 @@ SOMEBODY = walker(straight((0.0, 0.0), (0.0, 0.0)), np.zeros(1))[0]
 """Landmarks (k, 3) of a person who stands in the middle."""
 
 
+BESIDE = np.array([np.sin(0.3 + np.pi / 4), np.cos(0.3 + np.pi / 4)])
+"""A direction on the floor between those of two cameras: every view tells who stands there."""
+
+
 def aside(x_m: float, z_m: float = 0.0) -> np.ndarray:
     return SOMEBODY + [x_m, 0.0, z_m]
 
@@ -33,19 +37,29 @@ class Stage:
         self._frame = 0
 
     def show(
-        self, *bodies: np.ndarray, mirrored: tuple[np.ndarray, ...] = (), predicted=None
+        self,
+        *bodies: np.ndarray,
+        mirrored: tuple[np.ndarray, ...] = (),
+        predicted=None,
+        unseen_by: tuple[int, ...] = (),
+        left: int | None = None,
     ) -> list[TrackUpdate]:
-        """One instant; the people seen with left and right exchanged come last in every view."""
+        """One instant; the people seen with left and right exchanged come last in every view.
+
+        Cameras that they are `unseen_by` look and detect nobody; where one camera is `left`, the
+        others do not even look.
+        """
         everyone = [*bodies, *(body[BODY25.mirror] for body in mirrored)]
         views = []
-        for camera in self._rig.cameras:
+        for c, camera in enumerate(self._rig.cameras):
             keypoints = np.ones((len(everyone), len(SOMEBODY), 3))
             for n, body in enumerate(everyone):
                 keypoints[n, :, :2] = camera.project(body)
-            views.append(keypoints)
+            views.append(keypoints[:0] if c in unseen_by or left not in (None, c) else keypoints)
         now_ns = round(self._frame * 1e9 / RATE_HZ)
         self._frame += 1
-        detections = Detections(timestamp_ns=now_ns, people=tuple(views))
+        looked = tuple(left in (None, c) for c in range(len(views)))
+        detections = Detections(timestamp_ns=now_ns, people=tuple(views), looked=looked)
         return self._tracker.update(detections, predicted or {}, now_ns)
 
     def hold(self, seconds: float, *bodies: np.ndarray) -> list[TrackUpdate]:
@@ -112,19 +126,117 @@ def test_subject_stays_when_an_older_bystander_stands_in_the_same_place():
     assert list(subjects_of(stage.hold(1.0, aside(0.01), SOMEBODY)).values()) == [subject]
 
 
+# ------------------------------------------------------------------------------------------- find
+
+
+def test_newcomer_is_under_trial_for_two_instants_and_a_subject_in_the_third():
+    stage = Stage(Tracker(RIG, BODY25))
+    states = [stage.show(SOMEBODY)[0].state for _ in range(3)]
+    assert states == [TrackState.TENTATIVE, TrackState.TENTATIVE, TrackState.CONFIRMED]
+
+
+def test_whom_only_two_of_the_views_detect_becomes_a_subject_after_a_second():
+    stage = Stage(Tracker(RIG, BODY25))
+    reported = [stage.show(SOMEBODY, unseen_by=(2, 3)) for _ in range(33)]
+    assert reported[:30] == [[]] * 30 and len(reported[31]) == 1
+
+
+def test_person_who_jumps_out_of_the_gate_is_found_again_at_once():
+    stage = Stage(Tracker(RIG, BODY25))
+    stage.hold(0.5, SOMEBODY)
+    (update,) = stage.show(aside(*0.52 * BESIDE))
+    assert update.state is TrackState.CONFIRMED and np.all(update.person == 0)
+
+
+@pytest.mark.parametrize(
+    "other", [aside(*1.0 * BESIDE), of_size(0.65) + aside(*0.4 * BESIDE) - SOMEBODY]
+)
+def test_somebody_too_far_or_of_another_size_does_not_continue_a_track(other):
+    stage = Stage(Tracker(RIG, BODY25))
+    stage.hold(0.5, SOMEBODY)
+    before, newcomer = stage.show(other)
+    assert before.state is TrackState.COASTING
+    assert newcomer.state is TrackState.TENTATIVE and newcomer.track_id != before.track_id
+
+
+def test_skeleton_within_a_torso_of_a_track_is_nobody_new():
+    stage = Stage(Tracker(RIG, BODY25))
+    stage.hold(0.5, SOMEBODY)
+    assert len(stage.show(SOMEBODY, aside(*0.295 * BESIDE))) == 1
+
+
+def test_views_that_agree_take_the_only_detection_of_a_track_along():
+    rig = ring_of_cameras(3)
+    stage = Stage(Tracker(rig, BODY25), rig)
+    stage.hold(0.5, SOMEBODY)
+    # Away from one camera, which alone sees the person where it was expected.
+    (update,) = stage.show(aside(-0.5 * np.sin(0.3), -0.5 * np.cos(0.3)))
+    np.testing.assert_array_equal(update.person, 0)
+
+
 # ------------------------------------------------------------------------------------------ young
 
 
 def test_newcomer_under_trial_takes_no_detection_that_a_subject_can_have():
     stage = Stage(Tracker(RIG, BODY25))
     stage.hold(0.5, SOMEBODY)
-    # Between the directions of two cameras, so that every view tells the two apart.
-    beside = np.array([np.sin(0.3 + np.pi / 4), np.cos(0.3 + np.pi / 4)])
-    assert len(stage.show(SOMEBODY, aside(*0.5 * beside))) == 2
+    assert len(stage.show(SOMEBODY, aside(*0.5 * BESIDE))) == 2
     # One person is seen now, nearer to the newcomer.
-    subject, newcomer = stage.show(aside(*0.3 * beside))
+    subject, newcomer = stage.show(aside(*0.3 * BESIDE))
     assert subject.state is TrackState.CONFIRMED and np.all(subject.person == 0)
     assert newcomer.state is TrackState.TENTATIVE and np.all(newcomer.person == -1)
+
+
+def test_bystander_keeps_a_detection_that_fits_it_better_than_the_subject():
+    stage = Stage(Tracker(RIG, BODY25, TrackerOptions(max_subjects=1)))
+    (subject,) = stage.hold(0.5, SOMEBODY)
+    stage.hold(0.5, SOMEBODY, aside(*0.5 * BESIDE))
+    (update,) = stage.show(aside(*0.3 * BESIDE))
+    assert update.track_id == subject.track_id and update.state is TrackState.COASTING
+
+
+# ------------------------------------------------------------------------------------- one camera
+
+
+ACROSS = np.array([np.cos(0.3), -np.sin(0.3)])
+"""The direction on the floor in which the first camera sees somebody move sideways."""
+
+
+def test_track_that_one_view_shows_goes_along_sideways():
+    stage = Stage(Tracker(RIG, BODY25))
+    stage.hold(0.5, SOMEBODY)
+    for step in np.linspace(0.0, 1.5, 45):
+        upper = aside(*step * ACROSS)
+        upper[upper[:, 1] < 1.0] = np.nan
+        (update,) = stage.show(upper, unseen_by=(1, 2, 3))
+        np.testing.assert_array_equal(update.person, [0, -1, -1, -1])
+    (update,) = stage.show(aside(*1.5 * ACROSS))
+    np.testing.assert_array_equal(update.person, 0)
+
+
+def test_only_camera_left_finds_a_subject_again_beyond_the_gate():
+    stage = Stage(Tracker(RIG, BODY25))
+    (before,) = stage.hold(0.5, SOMEBODY)
+    for _ in range(3):
+        (update,) = stage.show(aside(*0.5 * ACROSS), left=0)
+        assert update.track_id == before.track_id and update.state is TrackState.CONFIRMED
+        np.testing.assert_array_equal(update.person, [0, -1, -1, -1])
+
+
+@pytest.mark.parametrize("place", [0, 1])
+def test_one_camera_begins_with_whoever_stands_at_the_start_position(place):
+    rig = ring_of_cameras(1)
+    bodies = [aside(-2.0), aside(-2.0)]
+    bodies[place] = SOMEBODY
+    ann = Subject(name="ann", start_m=(0.0, 0.0))
+    (update,) = Stage(Tracker(rig, BODY25, subjects=[ann]), rig).show(*bodies)
+    assert update.name == "ann" and update.person[0] == place
+
+
+def test_one_camera_waits_while_nobody_stands_at_the_start_position():
+    rig = ring_of_cameras(1)
+    ann = Subject(name="ann", start_m=(0.0, 0.0))
+    assert Stage(Tracker(rig, BODY25, subjects=[ann]), rig).show(aside(-2.0)) == []
 
 
 # ----------------------------------------------------------------------------------------- memory
@@ -145,6 +257,41 @@ def test_somebody_of_another_size_is_a_new_subject_where_there_is_room():
     known = subjects_of(stage.hold(3.0, SOMEBODY))
     stage.hold(3.0)
     assert not subjects_of(stage.hold(0.5, of_size(0.8))).items() & known.items()
+
+
+@pytest.mark.parametrize(("x_m", "same"), [(0.4, True), (1.5, False), (-1.5, False)])
+def test_who_comes_back_farther_than_the_missing_can_have_gone_is_a_new_subject(x_m, same):
+    middle = aside(0.0, 1.0)
+    stage = Stage(Tracker(RIG, BODY25, TrackerOptions(reach_speed_m_s=0.1)))
+    known = subjects_of(stage.hold(1.0, middle))
+    stage.hold(3.0)
+    assert (subjects_of(stage.hold(0.5, middle + [x_m, 0.0, 0.0])) == known) is same
+
+
+@pytest.mark.parametrize("place", [(1.5, 0.0), (-1.5, 0.0), (0.0, 1.5), (0.0, -1.5)])
+def test_nobody_becomes_a_subject_beyond_any_side_of_the_volume(place):
+    stage = Stage(Tracker(RIG, BODY25, TrackerOptions(volume_m=(-1.0, 1.0, -1.0, 1.0))))
+    assert stage.hold(0.5, aside(*place)) == []
+
+
+def test_somebody_of_another_size_is_the_missing_subject_where_there_is_no_other_place():
+    stage = Stage(Tracker(RIG, BODY25, TrackerOptions(max_subjects=1)))
+    known = subjects_of(stage.hold(3.0, SOMEBODY))
+    stage.hold(3.0)
+    assert subjects_of(stage.hold(0.5, of_size(0.8))) == known
+
+
+def test_somebody_of_another_size_takes_a_waiting_name_before_a_missing_one():
+    stage = Stage(Tracker(RIG, BODY25, subjects=[Subject(name="ann"), Subject(name="bob")]))
+    assert set(subjects_of(stage.hold(3.0, SOMEBODY))) == {"ann"}
+    stage.hold(3.0)
+    assert set(subjects_of(stage.hold(0.5, of_size(0.8)))) == {"bob"}
+
+
+def test_place_added_without_a_name_is_numbered():
+    tracker = Tracker(RIG, BODY25, subjects=[Subject(name="ann")])
+    tracker.add_subject()
+    assert set(subjects_of(Stage(tracker).hold(0.5, SOMEBODY, aside(1.0)))) == {"ann", "person1"}
 
 
 @pytest.mark.parametrize(
