@@ -16,8 +16,8 @@ from fusecap.live.devices.openpose_folder import MAX_PEOPLE, believable
 from fusecap.sources.imu_streams.lsl import sensor_channels
 from fusecap.sources.imu_streams.mvn import mvn_packet
 from fusecap.sources.imu_streams.osc import osc_packet
-from fusecap.sources.imu_streams.sample import MAX_DATAGRAM_BYTES, Packet, Refused
 from fusecap.sources.keypoint_files import MAX_FILE_BYTES, read_people
+from fusecap.sources.live_sensor import MAX_DATAGRAM_BYTES, Packet, Refused
 from fusecap.sources.synchronizer import world_from_imu_world
 from fusecap.types import ImuSample
 from imu_packets import mvn, mvn_segments, mvn_trackers, osc_bundle, osc_message

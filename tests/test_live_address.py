@@ -1,22 +1,22 @@
+import pkgutil
 from pathlib import Path
 
 import pytest
 
 from fusecap.errors import InputError, SessionError
+from fusecap.sources import imu_streams
+from fusecap.sources.imu_streams.mvn import SEGMENTS
 from fusecap.sources.live_address import (
-    MVN_SEGMENTS,
     Capture,
     GenICam,
     KeypointFolder,
-    LslSensor,
-    MvnSensor,
-    OscSensor,
     V4l2,
     VideoUrl,
     Webcam,
     parse_camera_address,
     parse_imu_address,
 )
+from fusecap.sources.live_sensor import SensorAddress
 from fusecap.sources.session import parse_session
 
 HD = Capture(size_px=(1280, 720), rate_hz=30.0, format="mjpeg")
@@ -45,15 +45,32 @@ def test_camera_addresses(text, expected):
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("lsl:imus", LslSensor(stream="imus")),
-        ("lsl:imus/left_shank", LslSensor(stream="imus", sensor="left_shank")),
-        ("osc://:9000/arm", OscSensor(host="127.0.0.1", port=9000, sensor="arm")),
-        ("osc://0.0.0.0:9000/a%20b", OscSensor(host="0.0.0.0", port=9000, sensor="a b")),
-        ("mvn:///Pelvis", MvnSensor(host="127.0.0.1", port=9763, segment="Pelvis")),
+        ("lsl:imus", SensorAddress(protocol="lsl", stream="imus")),
+        ("lsl:imus/left_shank", SensorAddress(protocol="lsl", stream="imus", sensor="left_shank")),
+        (
+            "osc://:9000/arm",
+            SensorAddress(protocol="osc", host="127.0.0.1", port=9000, sensor="arm"),
+        ),
+        (
+            "osc://0.0.0.0:9000/a%20b",
+            SensorAddress(protocol="osc", host="0.0.0.0", port=9000, sensor="a b"),
+        ),
+        (
+            "mvn:///Pelvis",
+            SensorAddress(
+                protocol="mvn",
+                host="127.0.0.1",
+                port=9763,
+                sensor="Pelvis?character=0&data=sensor",
+            ),
+        ),
         (
             "mvn://192.168.1.5:9764/LeftForeArm?character=1&data=segment",
-            MvnSensor(
-                host="192.168.1.5", port=9764, segment="LeftForeArm", character=1, kind="segment"
+            SensorAddress(
+                protocol="mvn",
+                host="192.168.1.5",
+                port=9764,
+                sensor="LeftForeArm?character=1&data=segment",
             ),
         ),
     ],
@@ -134,7 +151,12 @@ def test_password_is_not_shown():
 
 def test_segment_identities_are_those_of_the_published_table():
     """MVN network streaming specification, 3.1: an ID is the index + 1."""
-    assert len(MVN_SEGMENTS) == 23
-    assert [MVN_SEGMENTS.index(n) for n in ("Head", "RightHand", "LeftHand", "LeftToe")] == [
+    assert len(SEGMENTS) == 23
+    assert [SEGMENTS.index(n) for n in ("Head", "RightHand", "LeftHand", "LeftToe")] == [
         *(6, 10, 14, 22)
     ]
+
+
+def test_every_module_of_a_sensor_protocol_stands_in_the_table():
+    modules = {module.name for module in pkgutil.iter_modules(imu_streams.__path__)}
+    assert modules == set(imu_streams.NAMES)

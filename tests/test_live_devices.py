@@ -624,10 +624,10 @@ def test_sources_of_a_session_are_grouped_by_camera_stream_and_address(tmp_path)
     assert names == [
         "camera 'cam0'",
         "camera 'cam2'",
-        "imus lsl:imus",
         "imus osc://127.0.0.1:9000",
         "imus osc://127.0.0.1:9001",
         "imus mvn://127.0.0.1:9763",
+        "imus lsl:imus",
     ]
 
 

@@ -14,25 +14,15 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from urllib.parse import SplitResult, parse_qsl, unquote, urlsplit, urlunsplit
+from urllib.parse import SplitResult, parse_qsl, urlsplit, urlunsplit
 
 from fusecap.errors import InputError, nearest
+from fusecap.sources import imu_streams
+from fusecap.sources.live_sensor import SensorAddress
 
 LOOPBACK = "127.0.0.1"
 URL_SCHEMES = ("rtsp", "rtsps", "http", "https", "udp", "tcp", "rtp", "rtmp", "srt")
 """What FFmpeg may open for a session: the network, no files, devices or pipes."""
-MVN_PORT = 9763
-MVN_SEGMENTS = (
-    *("Pelvis", "L5", "L3", "T12", "T8", "Neck", "Head"),
-    *("RightShoulder", "RightUpperArm", "RightForeArm", "RightHand"),
-    *("LeftShoulder", "LeftUpperArm", "LeftForeArm", "LeftHand"),
-    *("RightUpperLeg", "RightLowerLeg", "RightFoot", "RightToe"),
-    *("LeftUpperLeg", "LeftLowerLeg", "LeftFoot", "LeftToe"),
-)
-"""In the order of their IDs, which count from 1 (MVN network streaming specification, 3.1)."""
-MVN_KINDS = ("sensor", "segment")
-"""What stands for a sensor: its own orientation (type 23), or its segment's (type 02)."""
-
 CAMERA_EXAMPLE = 'live = "v4l2:/dev/video0?size=1280x720&rate=30"'
 IMU_EXAMPLE = f'live = "osc://{LOOPBACK}:9000/left_forearm"'
 
@@ -96,38 +86,6 @@ class KeypointFolder:
 CameraAddress = Webcam | V4l2 | GenICam | VideoUrl | KeypointFolder
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LslSensor:
-    """A stream of the Lab Streaming Layer, and which sensor of it where it carries several."""
-
-    stream: str
-    sensor: str = ""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OscSensor:
-    """OSC messages of one name that arrive at an address of this machine."""
-
-    host: str
-    port: int
-    sensor: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MvnSensor:
-    """What Xsens MVN streams about one segment of one character to an address of this machine."""
-
-    host: str
-    port: int
-    segment: str
-    character: int = 0
-    kind: str = "sensor"
-    """One of `MVN_KINDS`."""
-
-
-ImuAddress = LslSensor | OscSensor | MvnSensor
-
-
 def parse_camera_address(text: str) -> CameraAddress:
     """Raises `InputError` that says what is wrong and gives an example."""
     scheme, _, rest = text.partition(":")
@@ -137,81 +95,55 @@ def parse_camera_address(text: str) -> CameraAddress:
         case "webcam":
             index, capture = _with_capture(text, rest)
             if not re.fullmatch(r"\d{1,3}", index):
-                raise _wrong(text, "expected the camera's number", 'live = "webcam:0"')
+                raise wrong_address(text, "expected the camera's number", 'live = "webcam:0"')
             return Webcam(index=int(index), capture=capture)
         case "v4l2":
             device, capture = _with_capture(text, rest)
             if not re.fullmatch(r"/dev/[\w./-]+", device) or ".." in device:
-                raise _wrong(text, "expected a device under /dev", CAMERA_EXAMPLE)
+                raise wrong_address(text, "expected a device under /dev", CAMERA_EXAMPLE)
             return V4l2(device=device, capture=capture)
         case "genicam":
             serial, capture = _with_capture(text, rest)
             if not serial:
-                raise _wrong(text, "the serial number is missing", 'live = "genicam:22345678"')
+                raise wrong_address(
+                    text, "the serial number is missing", 'live = "genicam:22345678"'
+                )
             return GenICam(serial=serial, capture=capture)
         case "openpose":
             if not rest:
-                raise _wrong(text, "the folder is missing", 'live = "openpose:keypoints/left"')
+                raise wrong_address(
+                    text, "the folder is missing", 'live = "openpose:keypoints/left"'
+                )
             return KeypointFolder(folder=Path(rest).expanduser())
     known = ("webcam", "v4l2", "genicam", "openpose", *URL_SCHEMES)
-    raise _wrong(
+    raise wrong_address(
         text, f"no kind of camera is called '{scheme}'{nearest(scheme, known)}", CAMERA_EXAMPLE
     )
 
 
-def parse_imu_address(text: str) -> ImuAddress:
+def parse_imu_address(text: str) -> SensorAddress:
     """Raises `InputError` that says what is wrong and gives an example."""
-    scheme, _, rest = text.partition(":")
-    if scheme == "lsl":
-        stream, _, sensor = rest.partition("/")
-        if not stream or {"'", '"'} & set(stream):
-            raise _wrong(
-                text, "expected a stream's name, without quotes", 'live = "lsl:imus/left_forearm"'
-            )
-        return LslSensor(stream=stream, sensor=sensor)
-    if scheme == "osc":
-        parts, host, port = _listening(text, IMU_EXAMPLE)
-        sensor = unquote(parts.path[1:])
-        if port is None or not sensor or parts.query:
-            raise _wrong(text, "expected a host, a port and the sensor's name", IMU_EXAMPLE)
-        return OscSensor(host=host, port=port, sensor=sensor)
-    if scheme == "mvn":
-        return _mvn(text)
-    known = ("lsl", "osc", "mvn")
-    raise _wrong(
-        text, f"no kind of sensor is called '{scheme}'{nearest(scheme, known)}", IMU_EXAMPLE
-    )
+    scheme = text.partition(":")[0]
+    if scheme not in imu_streams.NAMES:
+        raise wrong_address(
+            text,
+            f"no kind of sensor is called '{scheme}'{nearest(scheme, imu_streams.NAMES)}",
+            IMU_EXAMPLE,
+        )
+    return imu_streams.protocol_named(scheme).parse(text)
 
 
-def _mvn(text: str) -> MvnSensor:
-    example = f'live = "mvn://{LOOPBACK}:{MVN_PORT}/LeftForeArm"'
-    parts, host, port = _listening(text, example)
-    segment = unquote(parts.path[1:])
-    if segment not in MVN_SEGMENTS:
-        raise _wrong(text, f"no segment '{segment}'{nearest(segment, MVN_SEGMENTS)}", example)
-    options = _options(text, parts.query, ("character", "data"), example)
-    kind = options.get("data", MVN_KINDS[0])
-    if kind not in MVN_KINDS:
-        raise _wrong(text, f"data={kind}: expected {' or '.join(MVN_KINDS)}", example)
-    character = options.get("character", "0")
-    if not re.fullmatch(r"\d{1,3}", character) or int(character) > 255:
-        raise _wrong(text, f"character={character}: expected 0 to 255", example)
-    return MvnSensor(
-        host=host, port=port or MVN_PORT, segment=segment, character=int(character), kind=kind
-    )
-
-
-def _listening(text: str, example: str) -> tuple[SplitResult, str, int | None]:
+def listening(text: str, example: str) -> tuple[SplitResult, str, int | None]:
     """The address in its parts, with the host to bind to and the port."""
     try:
         parts = urlsplit(text)
         port = parts.port
     except ValueError:
-        raise _wrong(text, "the port must be a number from 1 to 65535", example) from None
+        raise wrong_address(text, "the port must be a number from 1 to 65535", example) from None
     if "://" not in text or parts.username is not None or parts.fragment:
-        raise _wrong(text, "expected a host, a port and a name", example)
+        raise wrong_address(text, "expected a host, a port and a name", example)
     if port == 0:
-        raise _wrong(text, "the port must be a number from 1 to 65535", example)
+        raise wrong_address(text, "the port must be a number from 1 to 65535", example)
     return parts, parts.hostname or LOOPBACK, port
 
 
@@ -221,46 +153,50 @@ def _video_url(text: str) -> VideoUrl:
         parts = urlsplit(text)
         _ = parts.port
     except ValueError as error:
-        raise _wrong(text, str(error), example) from None
+        raise wrong_address(text, str(error), example) from None
     if not parts.netloc:
-        raise _wrong(text, "the host is missing", example)
+        raise wrong_address(text, "the host is missing", example)
     return VideoUrl(url=text)
 
 
 def _with_capture(text: str, rest: str) -> tuple[str, Capture]:
     """What stands before the question mark, and what is asked for after it."""
     device, _, query = rest.partition("?")
-    options = _options(text, query, ("size", "rate", "format"), CAMERA_EXAMPLE)
+    options = address_options(text, query, ("size", "rate", "format"), CAMERA_EXAMPLE)
     size_px = rate_hz = None
     if "size" in options:
         size = re.fullmatch(r"([1-9]\d{1,4})x([1-9]\d{1,4})", options["size"])
         if size is None:
             found = options["size"]
-            raise _wrong(text, f"size={found}: expected WIDTHxHEIGHT in pixels", CAMERA_EXAMPLE)
+            raise wrong_address(
+                text, f"size={found}: expected WIDTHxHEIGHT in pixels", CAMERA_EXAMPLE
+            )
         size_px = int(size[1]), int(size[2])
     if "rate" in options:
         if not re.fullmatch(r"\d{1,4}(\.\d+)?", options["rate"]) or float(options["rate"]) <= 0:
             found = options["rate"]
-            raise _wrong(text, f"rate={found}: expected pictures per second", CAMERA_EXAMPLE)
+            raise wrong_address(text, f"rate={found}: expected pictures per second", CAMERA_EXAMPLE)
         rate_hz = float(options["rate"])
     pixels = options.get("format")
     if pixels is not None and not re.fullmatch(r"\w+", pixels):
-        raise _wrong(text, f"format={pixels}: expected a name such as mjpeg", CAMERA_EXAMPLE)
+        raise wrong_address(text, f"format={pixels}: expected a name such as mjpeg", CAMERA_EXAMPLE)
     return device, Capture(size_px=size_px, rate_hz=rate_hz, format=pixels)
 
 
-def _options(text: str, query: str, known: tuple[str, ...], example: str) -> dict[str, str]:
+def address_options(text: str, query: str, known: tuple[str, ...], example: str) -> dict[str, str]:
+    """What stands after the question mark; raises `InputError` for keys that are not `known`."""
     if not query:
         return {}
     try:
         pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=True, max_num_fields=8)
     except ValueError:
-        raise _wrong(text, "expected ?key=value&key=value", example) from None
+        raise wrong_address(text, "expected ?key=value&key=value", example) from None
     for key, _ in pairs:
         if key not in known:
-            raise _wrong(text, f"unknown option '{key}'{nearest(key, known)}", example)
+            raise wrong_address(text, f"unknown option '{key}'{nearest(key, known)}", example)
     return dict(pairs)
 
 
-def _wrong(text: str, what: str, example: str) -> InputError:
+def wrong_address(text: str, what: str, example: str) -> InputError:
+    """Says what is wrong with an address, and gives an example."""
     return InputError(f"found '{text}': {what}; write something like {example}")

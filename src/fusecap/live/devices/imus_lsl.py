@@ -10,7 +10,7 @@ from fusecap.errors import InputError
 from fusecap.live.devices.sensor_feed import SensorFeed
 from fusecap.live.devices.source import Deliver, SessionClock, SourceCounts, SourceLost
 from fusecap.sources.imu_streams.lsl import MAX_CHANNELS, SensorChannels, sensor_channels
-from fusecap.sources.imu_streams.sample import Refused
+from fusecap.sources.live_sensor import Refused
 
 RESOLVE_S = 1.0
 SILENCE_S = 2.0

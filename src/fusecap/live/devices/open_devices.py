@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import assert_never
 
@@ -15,21 +16,17 @@ from fusecap.live.devices.imus_udp import UdpImus
 from fusecap.live.devices.openpose_folder import OpenPoseSource
 from fusecap.live.devices.sensor_feed import SensorFeed
 from fusecap.live.devices.source import SessionClock, Source
-from fusecap.sources.imu_streams.mvn import mvn_packet, mvn_sensor_name
-from fusecap.sources.imu_streams.osc import osc_packet
-from fusecap.sources.imu_streams.sample import Packet
+from fusecap.sources.imu_streams import protocol_named
 from fusecap.sources.live_address import (
     GenICam,
     KeypointFolder,
-    LslSensor,
-    MvnSensor,
-    OscSensor,
     V4l2,
     VideoUrl,
     Webcam,
     parse_camera_address,
     parse_imu_address,
 )
+from fusecap.sources.live_sensor import SensorAddress
 from fusecap.sources.session import CameraSettings, Session
 from fusecap.sources.session_data import open_rig
 
@@ -98,41 +95,27 @@ def _camera(
 
 
 def _sensors(session: Session, clock: SessionClock) -> list[Source]:
-    streams: dict[str, Feeds] = {}
-    listeners: dict[tuple[str, str, int], Feeds] = {}
+    senders: dict[SensorAddress, Feeds] = {}
     for subject in session.subjects:
         for imu in subject.imus:
             if imu.live is None:
                 continue
             address = parse_imu_address(imu.live)
-            match address:
-                case LslSensor():
-                    feeds, name = streams.setdefault(address.stream, {}), address.sensor
-                case OscSensor():
-                    key = ("osc", address.host, address.port)
-                    feeds, name = listeners.setdefault(key, {}), address.sensor
-                case MvnSensor():
-                    key = ("mvn", address.host, address.port)
-                    feeds = listeners.setdefault(key, {})
-                    name = mvn_sensor_name(address.segment, address.character, address.kind)
-                case _:
-                    assert_never(address)
+            feeds = senders.setdefault(replace(address, sensor=""), {})
             feed = SensorFeed(subject=subject.name, bone=imu.bone, offset_s=imu.offset_s)
-            feeds.setdefault(name, []).append(feed)
-    return [
-        *(LslImus(stream=name, sensors=feeds, clock=clock) for name, feeds in streams.items()),
-        *(_udp(*key, feeds, clock) for key, feeds in listeners.items()),
-    ]
+            feeds.setdefault(address.sensor, []).append(feed)
+    return [_listener(sender, feeds, clock) for sender, feeds in senders.items()]
 
 
-def _udp(protocol: str, host: str, port: int, feeds: Feeds, clock: SessionClock) -> UdpImus:
-    parsers: dict[str, Callable[[bytes], Packet]] = {"osc": osc_packet, "mvn": mvn_packet}
-    shown = f"[{host}]" if ":" in host else host
+def _listener(address: SensorAddress, feeds: Feeds, clock: SessionClock) -> Source:
+    packet = protocol_named(address.protocol).packet
+    if packet is None:
+        return LslImus(stream=address.stream, sensors=feeds, clock=clock)
     return UdpImus(
-        name=f"imus {protocol}://{shown}:{port}",
-        host=host,
-        port=port,
-        parse=parsers[protocol],
+        name=f"imus {address.sender}",
+        host=address.host,
+        port=address.port,
+        parse=packet,
         sensors=feeds,
         clock=clock,
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from fusecap.live.devices.clock_map import ClockMap
-from fusecap.sources.imu_streams.sample import SensorSample
+from fusecap.sources.live_sensor import SensorSample
 from fusecap.types import ImuSample
 
 

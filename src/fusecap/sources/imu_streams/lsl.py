@@ -20,7 +20,10 @@ import numpy as np
 
 from fusecap.errors import InputError, nearest
 from fusecap.sources.imu_files.track import GRAVITY_M_S2
-from fusecap.sources.imu_streams.sample import (
+from fusecap.sources.live_address import wrong_address
+from fusecap.sources.live_sensor import (
+    SensorAddress,
+    SensorProtocol,
     SensorSample,
     checked_accel,
     checked_orientation,
@@ -104,3 +107,15 @@ def sensor_channels(
 
 def _plain(text: str) -> str:
     return re.sub(r"[\s_.\-/]", "", text).lower()
+
+
+def _address(text: str) -> SensorAddress:
+    stream, _, sensor = text.partition(":")[2].partition("/")
+    if not stream or {"'", '"'} & set(stream):
+        raise wrong_address(
+            text, "expected a stream's name, without quotes", 'live = "lsl:imus/left_forearm"'
+        )
+    return SensorAddress(protocol="lsl", stream=stream, sensor=sensor)
+
+
+PROTOCOL = SensorProtocol(parse=_address)

@@ -21,24 +21,40 @@ joint angles 20, ...) are passed over.
 
 from __future__ import annotations
 
+import re
 import struct
+from urllib.parse import unquote
 
 import numpy as np
 
+from fusecap.errors import nearest
 from fusecap.sources.imu_files.track import specific_force
-from fusecap.sources.imu_streams.sample import (
+from fusecap.sources.live_address import LOOPBACK, address_options, listening, wrong_address
+from fusecap.sources.live_sensor import (
     Packet,
     Refused,
+    SensorAddress,
+    SensorProtocol,
     SensorSample,
     checked_accel,
     checked_orientation,
 )
-from fusecap.sources.live_address import MVN_SEGMENTS
 
+MVN_PORT = 9763
+SEGMENTS = (
+    *("Pelvis", "L5", "L3", "T12", "T8", "Neck", "Head"),
+    *("RightShoulder", "RightUpperArm", "RightForeArm", "RightHand"),
+    *("LeftShoulder", "LeftUpperArm", "LeftForeArm", "LeftHand"),
+    *("RightUpperLeg", "RightLowerLeg", "RightFoot", "RightToe"),
+    *("LeftUpperLeg", "LeftLowerLeg", "LeftFoot", "LeftToe"),
+)
+"""In the order of their IDs, which count from 1 (MVN network streaming specification, 3.1)."""
+KINDS = ("sensor", "segment")
+"""What stands for a sensor: its own orientation (type 23), or its segment's (type 02)."""
 _HEADER = struct.Struct(">6sIBBIBBBBHH")
 _QUATERNION_AT = {"segment": 16, "sensor": 4}
 _SIZES = {"segment": (32,), "sensor": (44, 68)}
-_KINDS = {b"02": "segment", b"23": "sensor"}
+_TYPES = {b"02": "segment", b"23": "sensor"}
 
 
 def mvn_sensor_name(segment: str, character: int, kind: str) -> str:
@@ -66,7 +82,7 @@ def _samples(datagram: bytes, refused: list[str]) -> tuple[SensorSample, ...]:
     name, counter, _, items, time_ms, character, *_, payload = _HEADER.unpack_from(datagram)
     if name[:4] != b"MXTP" or not name[4:].isdigit():
         raise Refused("does not start with MXTP and a type")
-    kind = _KINDS.get(name[4:])
+    kind = _TYPES.get(name[4:])
     if kind is None:
         return ()
     body = len(datagram) - _HEADER.size
@@ -76,9 +92,9 @@ def _samples(datagram: bytes, refused: list[str]) -> tuple[SensorSample, ...]:
     segments, orientations, free_accels = [], [], []
     for at in range(_HEADER.size, len(datagram), size):
         (identity,) = struct.unpack_from(">i", datagram, at)
-        if not 1 <= identity <= len(MVN_SEGMENTS):
+        if not 1 <= identity <= len(SEGMENTS):
             continue
-        segment = MVN_SEGMENTS[identity - 1]
+        segment = SEGMENTS[identity - 1]
         try:
             wxyz = struct.unpack_from(">4f", datagram, at + _QUATERNION_AT[kind])
             orientation = checked_orientation(wxyz)
@@ -104,3 +120,27 @@ def _samples(datagram: bytes, refused: list[str]) -> tuple[SensorSample, ...]:
         )
         for segment, orientation, accel in zip(segments, orientations, accels, strict=True)
     )
+
+
+def _address(text: str) -> SensorAddress:
+    example = f'live = "mvn://{LOOPBACK}:{MVN_PORT}/LeftForeArm"'
+    parts, host, port = listening(text, example)
+    segment = unquote(parts.path[1:])
+    if segment not in SEGMENTS:
+        raise wrong_address(text, f"no segment '{segment}'{nearest(segment, SEGMENTS)}", example)
+    options = address_options(text, parts.query, ("character", "data"), example)
+    kind = options.get("data", KINDS[0])
+    if kind not in KINDS:
+        raise wrong_address(text, f"data={kind}: expected {' or '.join(KINDS)}", example)
+    character = options.get("character", "0")
+    if not re.fullmatch(r"\d{1,3}", character) or int(character) > 255:
+        raise wrong_address(text, f"character={character}: expected 0 to 255", example)
+    return SensorAddress(
+        protocol="mvn",
+        host=host,
+        port=port or MVN_PORT,
+        sensor=mvn_sensor_name(segment, int(character), kind),
+    )
+
+
+PROTOCOL = SensorProtocol(parse=_address, packet=mvn_packet)

@@ -14,12 +14,16 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
+from urllib.parse import unquote
 
 import numpy as np
 
-from fusecap.sources.imu_streams.sample import (
+from fusecap.sources.live_address import IMU_EXAMPLE, listening, wrong_address
+from fusecap.sources.live_sensor import (
     Packet,
     Refused,
+    SensorAddress,
+    SensorProtocol,
     SensorSample,
     checked_accel,
     checked_orientation,
@@ -131,3 +135,14 @@ def _string(packet: memoryview, at: int, what: str) -> tuple[str, int]:
         return head[:end].decode("utf-8"), after
     except UnicodeDecodeError:
         raise Refused(f"{what} is no text") from None
+
+
+def _address(text: str) -> SensorAddress:
+    parts, host, port = listening(text, IMU_EXAMPLE)
+    sensor = unquote(parts.path[1:])
+    if port is None or not sensor or parts.query:
+        raise wrong_address(text, "expected a host, a port and the sensor's name", IMU_EXAMPLE)
+    return SensorAddress(protocol="osc", host=host, port=port, sensor=sensor)
+
+
+PROTOCOL = SensorProtocol(parse=_address, packet=osc_packet)

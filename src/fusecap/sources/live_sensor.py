@@ -1,4 +1,4 @@
-"""What every live layout is brought to, and why a packet is refused.
+"""A live sensor as every protocol has it: address, samples, and why a packet is refused.
 
 Packets come from the network: whatever their bytes, a parser returns a `Packet` of samples that
 can be used and of reasons why the rest cannot, and takes no more memory than a few times its size.
@@ -7,7 +7,7 @@ can be used and of reasons why the rest cannot, and takes no more memory than a 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,6 +52,37 @@ class Packet:
     samples: tuple[SensorSample, ...] = ()
     refused: tuple[str, ...] = ()
     """Why the others in it, or all, cannot be used."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SensorAddress:
+    """Where a sensor's samples come from, and what it is called there."""
+
+    protocol: str
+    sensor: str = ""
+    """As the sender calls it; empty: the only one."""
+    stream: str = ""
+    """By its name in the network; empty: datagrams that arrive at host and port."""
+    host: str = ""
+    port: int = 0
+
+    @property
+    def sender(self) -> str:
+        """Without the sensor."""
+        if self.stream:
+            return f"{self.protocol}:{self.stream}"
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"{self.protocol}://{host}:{self.port}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SensorProtocol:
+    """What a protocol's module says of it."""
+
+    parse: Callable[[str], SensorAddress]
+    """Of a session's `live` key; raises `InputError` that says what is wrong."""
+    packet: Callable[[bytes], Packet] | None = None
+    """What a datagram holds; None: does not come in datagrams."""
 
 
 def checked_stamp_ns(seconds: float) -> int:
