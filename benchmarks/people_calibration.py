@@ -35,7 +35,7 @@ from fusecap.evaluate.rig_noise import RigNoise, believed
 from fusecap.evaluate.score import score_take
 from fusecap.evaluate.simulated_session import write_session
 from fusecap.geometry.camera import Rig
-from fusecap.sources.calibration_files import aniposelib
+from fusecap.sources.calibration_files.formats import aniposelib
 from fusecap.sources.session_data import SessionData
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))

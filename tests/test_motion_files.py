@@ -11,8 +11,8 @@ from fusecap.errors import InputError
 from fusecap.motion.files.amc import parse_amc, parse_asf
 from fusecap.motion.files.bvh import parse_bvh
 from fusecap.motion.files.expmap import parse_expmap
-from fusecap.motion.files.folder import MotionFolder
 from fusecap.motion.motion import CMU_UNIT_M
+from fusecap.motion.motion_folder import MotionFolder
 from motion_texts import BVH_TEXT, amc_text, asf_text, expmap_text
 
 

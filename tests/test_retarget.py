@@ -11,7 +11,7 @@ from fusecap.body.skeleton import EXTENDED23, PAPER21
 from fusecap.errors import InputError
 from fusecap.motion.files.amc import parse_amc, parse_asf
 from fusecap.motion.files.bvh import parse_bvh
-from fusecap.motion.files.folder import MotionFolder
+from fusecap.motion.motion_folder import MotionFolder
 from fusecap.motion.retarget import retarget, sole_heights_m
 from motion_texts import BVH_TEXT, amc_text, asf_text
 

@@ -13,14 +13,9 @@ from fusecap.body.shape import REFERENCE_HEIGHT_M, BodyShape
 from fusecap.body.skeleton import PAPER21
 from fusecap.errors import InputError
 from fusecap.evaluate.simulator import at_times, placed
-from fusecap.motion.files.amc import parse_amc, parse_asf
-from fusecap.motion.files.bvh import parse_bvh
-from fusecap.motion.files.expmap import parse_expmap
-from fusecap.motion.motion import Motion
+from fusecap.motion.files import motion_formats
 from fusecap.motion.retarget import retarget
 from fusecap.take import load_take
-
-SUFFIXES = (".bvh", ".amc", ".txt", ".npz")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,19 +53,20 @@ class MotionClip:
 
 
 def load_motion(path: Path) -> list[MotionClip]:
-    """BVH, AMC (its ASF beside it) and exponential maps hold one person, a take any number.
+    """A motion file holds one person, a take any number.
 
     Raises `InputError` where the file is missing, broken or of another kind.
     """
     suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise InputError(
-            f"{path}: no motion that is known; expected a .bvh, an .amc with its .asf beside it, "
-            "exponential maps (.txt) or a take (.npz)"
-        )
     if suffix == ".npz":
         return _of_take(path)
-    motion = _read(path, suffix)
+    formats = motion_formats()
+    if suffix not in formats:
+        known = ", ".join(format.what for format in formats.values())
+        raise InputError(f"{path}: no motion that is known; expected {known} or a take (.npz)")
+    format = formats[suffix]
+    others = sorted(path.parent.glob(f"*{format.beside}")) if format.beside else []
+    motion = format.parse(_text(path), str(path), {str(other): _text(other) for other in others})
     return [
         MotionClip(
             name=path.stem,
@@ -80,22 +76,6 @@ def load_motion(path: Path) -> list[MotionClip]:
             own_place=False,
         )
     ]
-
-
-def _read(path: Path, suffix: str) -> Motion:
-    text = _text(path)
-    if suffix == ".bvh":
-        return parse_bvh(text, str(path))
-    if suffix == ".txt":
-        return parse_expmap(text, str(path))
-    named = path.with_name(f"{path.stem.partition('_')[0]}.asf")
-    beside = [named] if named.is_file() else sorted(path.parent.glob("*.asf"))
-    if len(beside) != 1:
-        raise InputError(
-            f"{path}: expected its skeleton {named.name} beside it; "
-            f"found {', '.join(file.name for file in beside) or 'no .asf'}"
-        )
-    return parse_amc(text, parse_asf(_text(beside[0]), str(beside[0])), str(path))
 
 
 def _text(path: Path) -> str:

@@ -22,7 +22,7 @@ from fusecap.evaluate.simulator import Person, Simulation
 from fusecap.files import safe_name, written_whole
 from fusecap.geometry.quaternions import to_wxyz
 from fusecap.progress import Progress
-from fusecap.sources.calibration_files import aniposelib
+from fusecap.sources.calibration_files.formats import aniposelib
 from fusecap.sources.toml_text import quoted
 from fusecap.take import save_take
 

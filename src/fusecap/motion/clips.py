@@ -22,8 +22,8 @@ from fusecap.body.shape import REFERENCE_HEIGHT_M, BodyShape
 from fusecap.body.skeleton import PAPER21
 from fusecap.errors import InputError
 from fusecap.geometry.quaternions import to_wxyz
-from fusecap.motion.files.folder import MotionFolder
 from fusecap.motion.motion import Motion
+from fusecap.motion.motion_folder import MotionFolder
 from fusecap.motion.retarget import retarget, sole_heights_m
 from fusecap.motion.train_prior import ACKNOWLEDGEMENT, max_angles_rad
 

@@ -28,8 +28,8 @@ from scipy.stats import chi2
 from fusecap.body.prior import PosePrior
 from fusecap.body.skeleton import Skeleton
 from fusecap.errors import InputError
-from fusecap.motion.files.folder import MotionFolder
 from fusecap.motion.motion import Motion
+from fusecap.motion.motion_folder import MotionFolder
 from fusecap.motion.retarget import retarget
 from fusecap.progress import Progress
 

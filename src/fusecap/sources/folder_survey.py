@@ -11,14 +11,13 @@ from pathlib import Path
 
 from fusecap.body.landmarks import LANDMARK_SETS, LandmarkSet
 from fusecap.errors import FusecapError, InputError
-from fusecap.sources.calibration_files import load_rig
-from fusecap.sources.imu_files import sensor_names
+from fusecap.sources.calibration_files.loader import load_rig, may_be_calibration
+from fusecap.sources.imu_files import imu_format_of, sensor_names
 from fusecap.sources.sensor_bones import bone_of
 from fusecap.sources.video import VIDEO_SUFFIXES
 
 DEEPEST = 3
 """Folders below the surveyed one."""
-SNIFFED_CHARACTERS = 4096
 
 _DECORATION = re.compile(r"[_-]?(json|keypoints|openpose|pose)$", re.IGNORECASE)
 
@@ -92,13 +91,7 @@ def _files(folder: Path, depth: int) -> Iterator[Path]:
 
 def _calibration(folder: Path, files: list[Path]) -> tuple[Path | None, tuple[str, ...]]:
     """The first file that reads as a calibration, the least deep one first."""
-    candidates = [
-        file
-        for file in files
-        if file.name.endswith((".qca.txt", ".qca"))
-        or (file.suffix == ".toml" and file.name != "session.toml")
-        or (file.suffix == ".json" and "calib" in file.name.lower())
-    ]
+    candidates = [file for file in files if may_be_calibration(file)]
     for file in sorted(candidates, key=lambda file: len(file.parts)):
         for unit in ("m", "mm"):
             try:
@@ -127,7 +120,7 @@ def _holds(file: Path, landmarks: LandmarkSet) -> bool:
 
 
 def _sensors(folder: Path, file: Path) -> list[FoundSensor]:
-    format = _imu_format(file)
+    format = imu_format_of(file)
     if format is None:
         return []
     try:
@@ -140,24 +133,3 @@ def _sensors(folder: Path, file: Path) -> list[FoundSensor]:
     return [
         FoundSensor(file=path, format=format, sensor=name, bone=bone_of(name)) for name in names
     ]
-
-
-def _imu_format(file: Path) -> str | None:
-    if file.suffix.lower() == ".mvnx":
-        return "mvnx"
-    if file.suffix.lower() not in (".csv", ".txt", ".sto") or file.name.endswith(".qca.txt"):
-        return None
-    try:
-        with file.open(encoding="utf-8", errors="replace") as text:
-            head = text.read(SNIFFED_CHARACTERS)
-    except OSError:
-        return None
-    marks = {
-        "sto": "DataType=Quaternion",
-        "xsens-dot": "SampleTimeFine",
-        "xsens-mt": "PacketCounter",
-        "apdm-csv": "Orientation/Scalar",
-        "gaittoolbox-csv": "ori_1",
-        "csv": "time_s,qw",
-    }
-    return next((format for format, mark in marks.items() if mark.lower() in head.lower()), None)

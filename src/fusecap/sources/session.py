@@ -30,13 +30,13 @@ from fusecap.body.shape import MAX_HEIGHT_M, MIN_HEIGHT_M
 from fusecap.body.skeleton import Skeleton, skeleton_named
 from fusecap.errors import InputError, MotionError, SessionError, nearest
 from fusecap.sources.imu_calibration_files import read_imu_calibration
+from fusecap.sources.imu_files import formats as imu_formats
 from fusecap.sources.live_address import parse_camera_address, parse_imu_address
 
 FILE_NAME = "session.toml"
 KEYPOINT_FORMATS = tuple(f"openpose-{name}" for name in LANDMARK_SETS)
 MODEL_SUFFIXES = (".onnx", ".xml")
 """Of network files; anything else is a name."""
-IMU_FORMATS = ("csv", "xsens-mt", "xsens-dot", "mvnx", "sto", "apdm-csv", "gaittoolbox-csv")
 
 
 def _one_of(names: Iterable[str]) -> AfterValidator:
@@ -253,7 +253,7 @@ class ImuSettings(_Table):
     file: File | None = None
     live: Annotated[Name, _address(parse_imu_address)] | None = None
     """Where `fusecap live` gets its samples (`fusecap.sources.live_address`)."""
-    format: Annotated[str, _one_of(IMU_FORMATS)] = "csv"
+    format: Annotated[str, _one_of(imu_formats.NAMES)] = "csv"
     sensor: Name | None = None
     """Which sensor of a file that holds several."""
     rate_hz: Positive | None = None

@@ -30,7 +30,6 @@ from fusecap.evaluate.datasets.recording import LandmarkTruth, Recording, last_f
 from fusecap.evaluate.datasets.safe_pickle import load_npz_object
 from fusecap.geometry.camera import Y_UP_FROM_Z_UP, Rig
 from fusecap.sources.calibration_files import fields
-from fusecap.sources.calibration_files.json_file import load
 
 RATE_HZ = 50.0
 SUBJECTS = ("S9", "S11")
@@ -108,7 +107,7 @@ def load_take36(
 
 def read_rig(path: Path, subject: str) -> Rig:
     """A subject's cameras, called by their ids, in our world; raises `CalibrationError`."""
-    data = load(path)
+    data = fields.json_object(path)
     cameras = []
     for key, entry in data.items():
         if not key.startswith(f"{subject}_"):

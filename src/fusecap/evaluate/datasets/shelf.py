@@ -28,7 +28,6 @@ from fusecap.evaluate.shelf import MID_HIP, RATE_HZ, ShelfScore, ShelfTruth, loa
 from fusecap.evaluate.tables import Table
 from fusecap.geometry.camera import Y_UP_FROM_Z_UP, Rig
 from fusecap.sources.calibration_files import fields, load_rig
-from fusecap.sources.calibration_files.json_file import load
 
 LANDMARK_SET = "body25"
 SIZES_PX = {5: (1032, 776), 3: (360, 288)}
@@ -70,7 +69,7 @@ def read_rig(folder: Path) -> Rig:
 
 def read_voxelpose_rig(path: Path) -> Rig:
     """`{"0": {R, T (camera centre, mm), fx, fy, cx, cy, k, p}, ...}` in our world."""
-    data = load(path)
+    data = fields.json_object(path)
     size_px = SIZES_PX.get(len(data))
     if size_px is None:
         raise InputError(f"{path}: {len(data)} cameras; expected Shelf's 5 or Campus' 3")

@@ -7,8 +7,10 @@ C M Cᵀ. Angles are degrees, lengths the CMU unit divided by the skeleton's own
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import PurePath
 
 import numpy as np
 from jaxtyping import Float
@@ -16,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from fusecap.errors import InputError
 from fusecap.motion.motion import Motion, chain_rotations, numbers
+from fusecap.motion.motion_format import MotionFormat
 
 CMU_RATE_HZ = 120.0
 """AMC carries no rate; the CMU database is captured at 120 Hz."""
@@ -222,3 +225,21 @@ def _columns(
         if skeleton.channels[joint] and not columns[joint]:
             raise InputError(f"{name}: the first frame has no line for bone '{bone}'")
     return columns
+
+
+def _parse(text: str, path: str, beside: Mapping[str, str]) -> Motion:
+    """The skeleton is that of the take's subject, '01.asf' of '01_02.amc', or the only one."""
+    subject = re.split(r"[_.]", PurePath(path).name)[0]
+    named = [skeleton for skeleton in beside if PurePath(skeleton).stem == subject]
+    if len(named or beside) != 1:
+        raise InputError(
+            f"{path}: expected its skeleton '{subject}.asf' beside it; "
+            f"found {', '.join(beside) or 'no .asf'}"
+        )
+    skeleton = next(iter(named or beside))
+    return parse_amc(text, parse_asf(beside[skeleton], skeleton), path)
+
+
+FORMAT = MotionFormat(
+    what="an .amc with its .asf beside it", suffix=".amc", beside=".asf", parse=_parse
+)

@@ -19,6 +19,7 @@ from fusecap.motion.motion import (
     chain_rotations,
     numbers,
 )
+from fusecap.motion.motion_format import MotionFormat
 
 
 @dataclass
@@ -146,3 +147,8 @@ def _bone_vectors(joints: list[_Joint], ends: dict[int, list[float]]) -> Float[n
             offsets.append(ends[index])
         vectors[index] = next((offset for offset in offsets if np.any(offset)), np.zeros(3))
     return vectors
+
+
+FORMAT = MotionFormat(
+    what="a .bvh", suffix=".bvh", parse=lambda text, path, _beside: parse_bvh(text, path)
+)

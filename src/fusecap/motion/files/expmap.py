@@ -24,6 +24,7 @@ from fusecap.motion.motion import (
     chain_rotations,
     numbers,
 )
+from fusecap.motion.motion_format import MotionFormat
 
 RATE_HZ = 120.0
 
@@ -115,3 +116,11 @@ def _root_as_in_bvh(rotation: Float[np.ndarray, "t 3 3"]) -> Float[np.ndarray, "
         chosen[frame] = readings[frame, best] * (-1.0 if along[best] < 0 else 1.0)
         expected = 2 * chosen[frame] - chosen[frame - 1]
     return Rotation.from_quat(chosen).as_matrix()
+
+
+FORMAT = MotionFormat(
+    what="a .txt of exponential maps",
+    suffix=".txt",
+    parse=lambda text, path, _beside: parse_expmap(text, path),
+    holds=lambda text: "," in text.partition("\n")[0],
+)

@@ -1,7 +1,8 @@
-"""Numbers out of calibration files, with errors that say where they stand."""
+"""Values out of calibration files, with errors that say where they stand."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,17 @@ from scipy.spatial.transform import Rotation
 
 from fusecap.errors import CalibrationError
 from fusecap.geometry.camera import Camera
+
+
+def json_object(path: Path) -> dict[str, Any]:
+    """The object of a JSON file; raises `CalibrationError` for anything else."""
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, OSError) as error:
+        raise CalibrationError(f"{path}: not valid JSON: {error}") from None
+    if not isinstance(data, dict):
+        raise CalibrationError(f"{path}: expected a JSON object, found a {type(data).__name__}")
+    return data
 
 
 def numbers(value: Any, shape: tuple[int, ...], where: str) -> np.ndarray:

@@ -9,8 +9,7 @@ import numpy as np
 
 from fusecap.errors import CalibrationError
 from fusecap.geometry.camera import Y_UP_FROM_Z_UP, Camera, Rig
-from fusecap.sources.calibration_files import aniposelib, panoptic, qualisys, shelf
-from fusecap.sources.calibration_files.json_file import load
+from fusecap.sources.calibration_files.formats import rig_formats
 from fusecap.sources.calibration_files.plausibility import MILLIMETRES_ABOVE, camera_spread
 
 Y_UP_FROM = {
@@ -19,11 +18,6 @@ Y_UP_FROM = {
     "-y": np.diag([1.0, -1.0, -1.0]),
 }
 """Per up axis of a calibration's world, the rotation that brings it into ours."""
-
-_KNOWN = (
-    "expected an aniposelib-layout .toml (caliscope, Pose2Sim, FreeMoCap), a Qualisys .qca.txt, "
-    "a Panoptic calibration .json, or a folder with one .json per camera (K, RT, imgSize)"
-)
 
 
 def load_rig(path: Path | str, *, up: str = "y", unit: str = "m") -> Rig:
@@ -36,7 +30,7 @@ def load_rig(path: Path | str, *, up: str = "y", unit: str = "m") -> Rig:
     path = Path(path)
     cameras, unit_is_open = _read(path)
     if not cameras:
-        raise CalibrationError(f"{path}: holds no camera; {_KNOWN}")
+        raise CalibrationError(f"{path}: holds no camera; {_known()}")
     if unit_is_open and unit == "mm":
         cameras = [replace(camera, translation=camera.translation / 1000) for camera in cameras]
     try:
@@ -57,37 +51,33 @@ def load_rig(path: Path | str, *, up: str = "y", unit: str = "m") -> Rig:
     return rig
 
 
+def may_be_calibration(path: Path) -> bool:
+    """Whether the name of a file among others is that of a calibration."""
+    if path.suffix == ".json":
+        return "calib" in path.name.lower()
+    return path.name != "session.toml" and path.name.endswith(_suffixes())
+
+
+def _suffixes() -> tuple[str, ...]:
+    return tuple(suffix for format in rig_formats() for suffix in format.suffixes)
+
+
+def _known() -> str:
+    return "expected " + " or ".join(format.what for format in rig_formats())
+
+
 def _read(path: Path) -> tuple[list[Camera], bool]:
     """The cameras, and whether the format leaves their unit open."""
     if not path.exists():
-        raise CalibrationError(f"{path}: no such file or folder; {_KNOWN}")
-    if path.is_dir():
-        return _read_folder(path)
-    if path.suffix == ".toml":
-        return aniposelib.read(path), True
-    if path.name.endswith((".qca.txt", ".qca")):
-        return qualisys.read(path), False
-    if path.suffix == ".json":
-        data = load(path)
-        if isinstance(data.get("cameras"), list):
-            return panoptic.read(path, data), False
-        if {"K", "RT"} <= data.keys():
-            raise CalibrationError(
-                f"{path}: is one camera of a folder; name the folder as the calibration"
-            )
-    raise CalibrationError(f"{path}: not a calibration that is known; {_KNOWN}")
-
-
-def _read_folder(folder: Path) -> tuple[list[Camera], bool]:
-    files = [
-        file
-        for file in sorted(folder.iterdir())
-        if file.is_file() and (file.suffix in (".toml", ".json") or file.name.endswith(".qca.txt"))
-    ]
-    per_camera = [f for f in files if f.suffix == ".json" and not f.name.startswith("calibration_")]
-    if per_camera:
-        return shelf.read(folder), True
+        raise CalibrationError(f"{path}: no such file or folder; {_known()}")
+    for format in rig_formats():
+        cameras = format.read(path)
+        if cameras is not None:
+            return cameras, format.unit_is_open
+    if not path.is_dir():
+        raise CalibrationError(f"{path}: not a calibration that is known; {_known()}")
+    files = [f for f in sorted(path.iterdir()) if f.is_file() and f.name.endswith(_suffixes())]
     if len(files) != 1:
         found = f"{len(files)} calibration files" if files else "no calibration file"
-        raise CalibrationError(f"{folder}: holds {found}; name the one to read, {_KNOWN}")
+        raise CalibrationError(f"{path}: holds {found}; name the one to read, {_known()}")
     return _read(files[0])

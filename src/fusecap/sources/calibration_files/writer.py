@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from pathlib import Path
 
 from fusecap.errors import CalibrationError
 from fusecap.files import check_writable, write_whole
 from fusecap.geometry.camera import Rig
-from fusecap.sources.calibration_files import aniposelib, panoptic, qualisys, shelf
-
-CALISCOPE_NAME = "camera_array.toml"
-"""The one name under which caliscope looks for cameras, nested under `[cameras]`."""
-_FILE_NAME = re.compile(r"(?!calibration_)[^/\\\\:*?\"<>|\x00-\x1f]+")
+from fusecap.sources.calibration_files.formats import rig_formats
+from fusecap.sources.calibration_files.rig_format import RigFormat
 
 
 def write_rig(path: Path | str, rig: Rig, *, notes: Sequence[str] = ()) -> list[Path]:
@@ -29,7 +25,7 @@ def write_rig(path: Path | str, rig: Rig, *, notes: Sequence[str] = ()) -> list[
     if not len(rig):
         raise CalibrationError(f"{path}: a calibration without cameras is not written")
     check_rig_path(path)
-    texts = _texts(path, rig, notes)
+    texts = _format_of(path).texts(path, rig, notes)
     for file, text in texts.items():
         write_whole(file, text)
     return list(texts)
@@ -37,36 +33,13 @@ def write_rig(path: Path | str, rig: Rig, *, notes: Sequence[str] = ()) -> list[
 
 def check_rig_path(path: Path) -> None:
     """Before the work that finds the cameras: raises where `write_rig` could not write them."""
-    if path.name.endswith((".toml", ".json", ".qca.txt", ".qca")):
-        check_writable(path)
-    elif path.suffix or path.is_file():
-        raise CalibrationError(
-            f"{path}: no calibration format has this name; expected .toml (aniposelib, Pose2Sim, "
-            "FreeMoCap, caliscope), .qca.txt (Qualisys), .json (Panoptic), or a folder's name for "
-            "one JSON per camera"
-        )
-    else:
-        check_writable(path / "camera.json")
+    check_writable(path if _format_of(path).suffixes else path / "camera.json")
 
 
-def _texts(path: Path, rig: Rig, notes: Sequence[str]) -> dict[Path, str]:
-    cameras = rig.cameras
-    if path.suffix == ".toml":
-        nested = path.name == CALISCOPE_NAME
-        return {path: aniposelib.dumps(cameras, notes=notes, nested=nested)}
-    if path.name.endswith((".qca.txt", ".qca")):
-        return {path: qualisys.dumps(cameras)}
-    if path.suffix == ".json":
-        return {path: panoptic.dumps(cameras)}
-    for camera in cameras:
-        if not _FILE_NAME.fullmatch(camera.name):
-            raise CalibrationError(
-                f"{path}: camera '{camera.name}' cannot name a file of the folder; write a .toml"
-            )
-    others = {file.stem for file in path.glob("*.json")} - set(rig.names)
-    if others:
-        raise CalibrationError(
-            f"{path}: holds other cameras already ({', '.join(sorted(others)[:5])}), which would "
-            "be read with these; name another folder"
-        )
-    return {path / f"{camera.name}.json": shelf.dumps(camera) for camera in cameras}
+def _format_of(path: Path) -> RigFormat:
+    """By the name of what is to be written."""
+    for format in rig_formats():
+        if format.has_name(path):
+            return format
+    known = " or ".join(format.what for format in rig_formats())
+    raise CalibrationError(f"{path}: no calibration format has this name; expected {known}")

@@ -2,15 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 from fusecap.errors import InputError, nearest
-from fusecap.sources.imu_files import apdm, csv, gaittoolbox, mvnx, sto, xsens_dot, xsens_mt
+from fusecap.sources.imu_files.formats import NAMES, format_named
 from fusecap.sources.imu_files.track import ImuTrack
 
-_SEVERAL_SENSORS = {"mvnx": mvnx, "sto": sto, "apdm-csv": apdm}
-_OWN_TIMES = {"csv": csv, "xsens-dot": xsens_dot}
-_COUNTED = {"xsens-mt": xsens_mt, "gaittoolbox-csv": gaittoolbox}
+_SNIFFED_CHARACTERS = 4096
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImuFormat:
+    """What a format's module says of it."""
+
+    read: Callable[[Path, str | None, float | None], ImuTrack]
+    """Of a file the sensor of this name, at this rate where the file does not state one; raises
+    `InputError`."""
+    sensors: Callable[[Path], tuple[str, ...]] | None = None
+    """Names of the sensors in a file that holds several."""
+    suffixes: tuple[str, ...] = (".csv", ".txt", ".sto")
+    mark: str = ""
+    """What stands near the beginning of such a file, in any case of letters."""
 
 
 def read_imu(
@@ -28,17 +42,26 @@ def read_imu(
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected IMU samples")
-    if format in _SEVERAL_SENSORS:
-        return _SEVERAL_SENSORS[format].read(path, sensor)
-    if format in _OWN_TIMES:
-        return _OWN_TIMES[format].read(path)
-    if format in _COUNTED:
-        return _COUNTED[format].read(path, rate_hz)
-    known = (*_OWN_TIMES, *_COUNTED, *_SEVERAL_SENSORS)
-    raise InputError(f"no IMU format '{format}'{nearest(format, known)}")
+    if format not in NAMES:
+        raise InputError(f"no IMU format '{format}'{nearest(format, NAMES)}")
+    return format_named(format).read(path, sensor, rate_hz)
 
 
 def sensor_names(path: Path | str, format: str) -> tuple[str, ...]:
     """The sensors in a file of a format that holds several; empty for the others."""
-    module = _SEVERAL_SENSORS.get(format)
-    return module.sensors(Path(path)) if module else ()
+    sensors = format_named(format).sensors
+    return sensors(Path(path)) if sensors else ()
+
+
+def imu_format_of(path: Path) -> str | None:
+    """The format that the file's suffix and first characters tell, if any."""
+    suffix = path.suffix.lower()
+    likely = [name for name in NAMES if suffix in format_named(name).suffixes]
+    if not likely or path.name.endswith(".qca.txt"):
+        return None
+    try:
+        with path.open(encoding="utf-8", errors="replace") as text:
+            head = text.read(_SNIFFED_CHARACTERS).lower()
+    except OSError:
+        return None
+    return next((name for name in likely if format_named(name).mark.lower() in head), None)

@@ -1,4 +1,4 @@
-"""Delimited text with a header line, as most IMU software exports it."""
+"""Delimited text with a header line, as most IMU software exports it, and its sensors."""
 
 from __future__ import annotations
 
@@ -80,3 +80,16 @@ def number(cell: str) -> float:
         return float(cell)
     except ValueError:
         return float("nan")
+
+
+def chosen(path: Path, wanted: str | None, present: Sequence[str]) -> str:
+    """The wanted sensor, or the only one; raises `InputError` naming those present."""
+    if wanted is None:
+        if len(present) == 1:
+            return present[0]
+        raise InputError(
+            f"{path}: holds {len(present)} sensors ({', '.join(present)}); give sensor of this imu"
+        )
+    if wanted not in present:
+        raise InputError(f"{path}: no sensor '{wanted}'{nearest(wanted, present)}")
+    return wanted

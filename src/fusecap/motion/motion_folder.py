@@ -1,23 +1,20 @@
 """Every take in a folder, loose or in tar archives.
 
 A take's key is its path without suffix, as 'asfamc/01/01_01' or 'bvh/06_02': the folder's or the
-archive's inside. An AMC take needs its skeleton beside it, '01.asf' or the only ASF there.
+archive's inside.
 """
 
 from __future__ import annotations
 
-import re
 import tarfile
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 
 from fusecap.errors import InputError, nearest
-from fusecap.motion.files.amc import parse_amc, parse_asf
-from fusecap.motion.files.bvh import parse_bvh
-from fusecap.motion.files.expmap import parse_expmap
+from fusecap.motion.files import motion_formats
 from fusecap.motion.motion import Motion
+from fusecap.motion.motion_format import MotionFormat
 
-_TAKE_SUFFIXES = (".amc", ".bvh", ".txt")
 _ARCHIVES = ("*.tar", "*.tar.xz", "*.tar.gz", "*.tgz")
 
 
@@ -28,16 +25,17 @@ class MotionFolder:
         """Raises `InputError` where the folder is missing or holds no take."""
         if not folder.is_dir():
             raise InputError(f"no folder of motion at {folder}")
-        self._texts = _texts(folder)
+        self._formats = motion_formats()
+        self._texts = _texts(folder, self._formats)
         self._takes = {
             path.removesuffix(PurePosixPath(path).suffix): path
             for path in sorted(self._texts)
-            if PurePosixPath(path).suffix in _TAKE_SUFFIXES
+            if PurePosixPath(path).suffix in self._formats
         }
         if not self._takes:
             raise InputError(
-                f"{folder} holds no motion; expected .asf with .amc, .bvh or exponential-map .txt "
-                "files, loose or in tar archives"
+                f"{folder} holds no motion, loose or in tar archives; expected "
+                + " or ".join(format.what for format in self._formats.values())
             )
 
     @property
@@ -50,42 +48,28 @@ class MotionFolder:
         if key not in self._takes:
             raise InputError(f"no take '{key}'{nearest(key, self._takes)}")
         path = self._takes[key]
-        text = self._texts[path]
-        match PurePosixPath(path).suffix:
-            case ".amc":
-                skeleton = self._skeleton_of(path)
-                return parse_amc(text, parse_asf(self._texts[skeleton], skeleton), path)
-            case ".bvh":
-                return parse_bvh(text, path)
-            case _:
-                return parse_expmap(text, path)
-
-    def _skeleton_of(self, take: str) -> str:
-        beside = PurePosixPath(take).parent
-        subject = re.split(r"[_.]", PurePosixPath(take).name)[0]
-        skeletons = [
-            path
-            for path in self._texts
-            if path.endswith(".asf") and PurePosixPath(path).parent == beside
-        ]
-        named = [path for path in skeletons if PurePosixPath(path).stem == subject]
-        if len(named or skeletons) != 1:
-            raise InputError(
-                f"{take}: expected its skeleton '{subject}.asf' beside it; "
-                f"found {', '.join(skeletons) or 'no .asf'}"
-            )
-        return (named or skeletons)[0]
+        format = self._formats[PurePosixPath(path).suffix]
+        folder = PurePosixPath(path).parent
+        beside = {
+            other: text
+            for other, text in self._texts.items()
+            if format.beside
+            and other.endswith(format.beside)
+            and PurePosixPath(other).parent == folder
+        }
+        return format.parse(self._texts[path], path, beside)
 
 
-def _texts(folder: Path) -> Mapping[str, str]:
+def _texts(folder: Path, formats: Mapping[str, MotionFormat]) -> Mapping[str, str]:
     texts: dict[str, str] = {}
 
     def add(path: str, content: bytes) -> None:
         text = content.decode("utf-8", errors="replace")
-        if not path.endswith(".txt") or "," in text.partition("\n")[0]:
+        format = formats.get(PurePosixPath(path).suffix)
+        if format is None or format.holds(text):
             texts[path] = text
 
-    wanted = (".asf", *_TAKE_SUFFIXES)
+    wanted = {*formats, *(format.beside for format in formats.values() if format.beside)}
     for file in sorted(folder.rglob("*")):
         if file.suffix in wanted and file.is_file():
             add(file.relative_to(folder).as_posix(), file.read_bytes())

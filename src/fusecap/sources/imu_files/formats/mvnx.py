@@ -14,12 +14,12 @@ import numpy as np
 
 from fusecap.errors import InputError
 from fusecap.sources import safe_xml
-from fusecap.sources.imu_files.sensors import chosen
-from fusecap.sources.imu_files.table import number
+from fusecap.sources.imu_files.loader import ImuFormat
+from fusecap.sources.imu_files.table import chosen, number
 from fusecap.sources.imu_files.track import ImuTrack, specific_force, tidy
 
 
-def read(path: Path, sensor: str | None) -> ImuTrack:
+def read(path: Path, sensor: str | None, _rate_hz: float | None) -> ImuTrack:
     """The samples of one sensor; raises `InputError`."""
     root = _root(path)
     names = _names(root)
@@ -70,3 +70,6 @@ def _vectors(frames: list[ElementTree.Element], tag: str, sensor: int, size: int
         if len(words) == size:
             row[:] = [number(word) for word in words]
     return result
+
+
+FORMAT = ImuFormat(read=read, sensors=sensors, suffixes=(".mvnx",))

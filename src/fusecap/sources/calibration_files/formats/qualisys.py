@@ -15,16 +15,20 @@ from xml.etree import ElementTree
 import numpy as np
 
 from fusecap.errors import CalibrationError
-from fusecap.geometry.camera import Camera
+from fusecap.geometry.camera import Camera, Rig
 from fusecap.sources import safe_xml
 from fusecap.sources.calibration_files import fields
+from fusecap.sources.calibration_files.rig_format import RigFormat
 
+SUFFIXES = (".qca.txt", ".qca")
 SUBPIXELS = 64.0
 _FLIP = np.diag([1.0, -1.0, -1.0])
 
 
-def read(path: Path) -> list[Camera]:
+def read(path: Path) -> list[Camera] | None:
     """The active cameras, translations in metres; raises `CalibrationError`."""
+    if not path.name.endswith(SUFFIXES) or path.is_dir():
+        return None
     try:
         root = safe_xml.parse(path)
     except safe_xml.XmlError as error:
@@ -133,3 +137,12 @@ def _attributes(element: ElementTree.Element, tag: str, where: str) -> dict[str,
     if found is None:
         raise CalibrationError(f"{where} has no <{tag}>")
     return dict(found.attrib)
+
+
+def _file(path: Path, rig: Rig, _notes: Sequence[str]) -> dict[Path, str]:
+    return {path: dumps(rig.cameras)}
+
+
+FORMAT = RigFormat(
+    what="a .qca.txt of Qualisys", suffixes=SUFFIXES, unit_is_open=False, read=read, texts=_file
+)

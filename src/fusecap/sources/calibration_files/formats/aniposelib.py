@@ -27,13 +27,19 @@ from typing import Any
 from scipy.spatial.transform import Rotation
 
 from fusecap.errors import CalibrationError
-from fusecap.geometry.camera import Camera
+from fusecap.geometry.camera import Camera, Rig
 from fusecap.sources.calibration_files import fields
+from fusecap.sources.calibration_files.rig_format import RigFormat
 from fusecap.sources.toml_text import quoted
 
+CALISCOPE_NAME = "camera_array.toml"
+"""The one name under which caliscope looks for cameras, nested under `[cameras]`."""
 
-def read(path: Path) -> list[Camera]:
+
+def read(path: Path) -> list[Camera] | None:
     """The cameras, translations in the file's unit; raises `CalibrationError`."""
+    if path.suffix != ".toml" or path.is_dir():
+        return None
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
@@ -102,3 +108,16 @@ def _camera(path: Path, key: str, table: dict[str, Any]) -> Camera:
         rotation=fields.rotation_matrix(table["rotation"], f"{where} rotation"),
         translation=fields.numbers(table["translation"], (3,), f"{where} translation"),
     )
+
+
+def _texts(path: Path, rig: Rig, notes: Sequence[str]) -> dict[Path, str]:
+    return {path: dumps(rig.cameras, notes=notes, nested=path.name == CALISCOPE_NAME)}
+
+
+FORMAT = RigFormat(
+    what="a .toml in the layout of aniposelib (caliscope, Pose2Sim, FreeMoCap)",
+    suffixes=(".toml",),
+    unit_is_open=True,
+    read=read,
+    texts=_texts,
+)

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from fusecap.sources.imu_files.loader import ImuFormat
 from fusecap.sources.imu_files.table import read_table
 from fusecap.sources.imu_files.track import ImuTrack, tidy
 
 
-def read(path: Path) -> ImuTrack:
+def read(path: Path, _sensor: str | None, _rate_hz: float | None) -> ImuTrack:
     """The samples; raises `InputError`."""
     table = read_table(path, "time_s")
     return tidy(
@@ -21,3 +22,6 @@ def read(path: Path) -> ImuTrack:
         table.take(["qw", "qx", "qy", "qz"]),
         table.take_or_nan(["ax", "ay", "az"]),
     )
+
+
+FORMAT = ImuFormat(read=read, mark="time_s,qw")

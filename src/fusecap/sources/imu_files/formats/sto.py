@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from fusecap.errors import InputError
-from fusecap.sources.imu_files.sensors import chosen
-from fusecap.sources.imu_files.table import number, read_lines
+from fusecap.sources.imu_files.loader import ImuFormat
+from fusecap.sources.imu_files.table import chosen, number, read_lines
 from fusecap.sources.imu_files.track import ImuTrack, tidy
 
 
-def read(path: Path, sensor: str | None) -> ImuTrack:
+def read(path: Path, sensor: str | None, _rate_hz: float | None) -> ImuTrack:
     """The samples of one column; raises `InputError`."""
     columns, body = _table(path)
     name = chosen(path, sensor, columns[1:])
@@ -53,3 +53,6 @@ def _table(path: Path) -> tuple[list[str], list[str]]:
     if not body or not body[0].startswith("time"):
         raise InputError(f"{path}: no 'time' column below the header")
     return body[0].split("\t"), body[1:]
+
+
+FORMAT = ImuFormat(read=read, sensors=sensors, mark="DataType=Quaternion")

@@ -12,13 +12,14 @@ from pathlib import Path
 import numpy as np
 
 from fusecap.errors import InputError
+from fusecap.sources.imu_files.loader import ImuFormat
 from fusecap.sources.imu_files.table import read_table
 from fusecap.sources.imu_files.track import ImuTrack, tidy
 
 _RATE = re.compile(r"fs=\s*([\d.]+)")
 
 
-def read(path: Path, rate_hz: float | None) -> ImuTrack:
+def read(path: Path, _sensor: str | None, rate_hz: float | None) -> ImuTrack:
     """The samples, starting at time 0; `rate_hz` is needed where the header does not say it."""
     table = read_table(path, "ori_1")
     match = _RATE.search(" ".join(table.preamble))
@@ -31,3 +32,6 @@ def read(path: Path, rate_hz: float | None) -> ImuTrack:
         table.take([f"ori_{i}" for i in (1, 2, 3, 4)]),
         table.take_or_nan([f"acc_{i}" for i in (1, 2, 3)]),
     )
+
+
+FORMAT = ImuFormat(read=read, mark="ori_1")

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from fusecap.errors import InputError
 from fusecap.geometry.quaternions import to_wxyz
+from fusecap.sources.imu_files.loader import ImuFormat
 from fusecap.sources.imu_files.table import Table, read_table
 from fusecap.sources.imu_files.track import ImuTrack, SharedClock, tidy, unwrapped
 
@@ -28,7 +29,7 @@ _EULER_XYZ = ["Roll", "Pitch", "Yaw"]
 _RATE = re.compile(r"Update Rate:\s*([\d.]+)", re.IGNORECASE)
 
 
-def read(path: Path, rate_hz: float | None) -> ImuTrack:
+def read(path: Path, _sensor: str | None, rate_hz: float | None) -> ImuTrack:
     """The samples, starting at time 0; `rate_hz` is needed where the header does not say it."""
     table = read_table(path, "PacketCounter")
     rate = _rate_hz(table, rate_hz)
@@ -83,3 +84,6 @@ def _orientation_wxyz(table: Table) -> np.ndarray:
     if rotation is not None:
         result[usable] = to_wxyz(rotation)
     return result
+
+
+FORMAT = ImuFormat(read=read, mark="PacketCounter")

@@ -11,17 +11,22 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from fusecap.errors import CalibrationError
-from fusecap.geometry.camera import Camera
+from fusecap.geometry.camera import Camera, Rig
 from fusecap.sources.calibration_files import fields
+from fusecap.sources.calibration_files.rig_format import RigFormat
 
 METRES_PER_CENTIMETRE = 0.01
 
 
-def read(path: Path, data: dict[str, Any]) -> list[Camera]:
+def read(path: Path) -> list[Camera] | None:
     """The cameras, translations in metres; raises `CalibrationError`."""
+    if path.suffix != ".json" or path.is_dir():
+        return None
+    data = fields.json_object(path)
+    if not isinstance(data.get("cameras"), list):
+        return None
     cameras = []
     for index, entry in enumerate(data["cameras"]):
         where = f"{path}: cameras[{index}]"
@@ -62,3 +67,16 @@ def dumps(cameras: Sequence[Camera]) -> str:
     ]
     document = {"units": "t in centimetres, K in pixels", "cameras": entries}
     return json.dumps(document, indent=1, ensure_ascii=False) + "\n"
+
+
+def _texts(path: Path, rig: Rig, _notes: Sequence[str]) -> dict[Path, str]:
+    return {path: dumps(rig.cameras)}
+
+
+FORMAT = RigFormat(
+    what="a calibration .json of Panoptic",
+    suffixes=(".json",),
+    unit_is_open=False,
+    read=read,
+    texts=_texts,
+)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fusecap.sources.imu_files.loader import ImuFormat
 from fusecap.sources.imu_files.table import read_table
 from fusecap.sources.imu_files.track import ImuTrack, SharedClock, specific_force, tidy, unwrapped
 
@@ -17,7 +18,7 @@ TICKS_PER_SECOND = 1e6
 CLOCK_MODULUS = 2**32
 
 
-def read(path: Path) -> ImuTrack:
+def read(path: Path, _sensor: str | None, _rate_hz: float | None) -> ImuTrack:
     """The samples, starting at time 0; raises `InputError`."""
     table = read_table(path, "PacketCounter")
     ticks = table.take(["SampleTimeFine"])[:, 0]
@@ -34,3 +35,6 @@ def read(path: Path) -> ImuTrack:
             start_s=first / TICKS_PER_SECOND, period_s=CLOCK_MODULUS / TICKS_PER_SECOND
         ),
     )
+
+
+FORMAT = ImuFormat(read=read, mark="SampleTimeFine")

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from fusecap.sources.imu_files.sensors import chosen
-from fusecap.sources.imu_files.table import Table, read_table
+from fusecap.sources.imu_files.loader import ImuFormat
+from fusecap.sources.imu_files.table import Table, chosen, read_table
 from fusecap.sources.imu_files.track import ImuTrack, tidy
 
 _SCALAR = "/Orientation/Scalar"
 
 
-def read(path: Path, sensor: str | None) -> ImuTrack:
+def read(path: Path, sensor: str | None, _rate_hz: float | None) -> ImuTrack:
     """The samples of one sensor; raises `InputError`."""
     table = read_table(path, "Time", units_line=True)
     name = chosen(path, sensor, _names(table))
@@ -35,3 +35,6 @@ def sensors(path: Path) -> tuple[str, ...]:
 
 def _names(table: Table) -> tuple[str, ...]:
     return tuple(c.removesuffix(_SCALAR) for c in table.columns if c.endswith(_SCALAR))
+
+
+FORMAT = ImuFormat(read=read, sensors=sensors, mark="Orientation/Scalar")
