@@ -19,6 +19,7 @@ from fusecap.live.recorder import RecordSwitch
 from fusecap.live.run import LiveOptions, LiveRun
 from fusecap.live.status import Light
 from fusecap.recording.reader import Recording
+from fusecap.streams.output import StreamStatus
 from fusecap.types import CameraSample, Command, CommandKind, ImuSample, Tick
 from live_fakes import (
     FakeDetector,
@@ -479,6 +480,27 @@ def test_status_comes_once_a_second_and_the_report_is_plain():
     assert plain["inputs"][0]["light"] == "waiting"
     assert plain["inputs"][0]["age_s"] is None
     assert plain["subjects"]["anna"]["tracked_share"] == 1.0
+
+
+def test_packets_are_counted_per_person_and_second_over_the_mean_of_the_streams():
+    class Sender(Notes):
+        @property
+        def poses(self) -> float:
+            return len(self.steps)
+
+        def stream_statuses(self) -> tuple[StreamStatus, ...]:
+            return (StreamStatus(to="lsl", sent=0, dropped=0, refused=0, failed=0, remark=""),)
+
+    sender = Sender()
+    run = make_run(listeners=[sender])
+    with Going(run) as going:
+        wait_for(lambda: len(sender.statuses) >= 2)
+    status = sender.statuses[1]
+    assert [stream.to for stream in status.streams] == ["lsl"]
+    assert going.report is not None
+    for seen in (status, going.report):
+        assert seen.packets_per_s == pytest.approx(seen.solves_per_s, rel=0.5)
+        assert seen.packets_per_s > 5
 
 
 # Parts

@@ -19,22 +19,21 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 from fusecap.detect.detector import Detector
-from fusecap.engine.engine import Engine, LiveStep
+from fusecap.engine.engine import Engine
 from fusecap.live.detection import DetectionLoop
 from fusecap.live.devices.source import Delivery, SessionClock, Source
 from fusecap.live.feed import Feed
 from fusecap.live.health import Incidents, Key, ProcessLoad, inputs_of, key_of
 from fusecap.live.inbox import Inbox
 from fusecap.live.latency import CAMERA, SENSOR, LatencyBook
+from fusecap.live.listeners import Listener, Listeners
 from fusecap.live.report import LiveReport, subject_reports
 from fusecap.live.solving import LiveEngine, Solving
-from fusecap.live.status import LiveStatus, RecordingStatus, SourceStatus
+from fusecap.live.status import LiveStatus, SourceStatus
 from fusecap.setup import SessionSetup
-from fusecap.streams.output import StreamStatus
-from fusecap.types import CameraImage, CameraSample, Command, Event
+from fusecap.types import CameraImage, CameraSample, Command
 
 DELAY_WITH_DETECTOR_S = 0.2
 DELAY_S = 0.05
@@ -46,59 +45,6 @@ _SHOWN = 20
 """Incidents in a status."""
 _JOIN_S = 2.0
 """For all threads together, when the run ends."""
-
-
-@runtime_checkable
-class Listener(Protocol):
-    """Takes part in a run: recorder, streams, viewer.
-
-    Every call must return at once. One that raises is left out from then on. `on_event` and
-    `on_step` come from the solver's thread, `on_image` from the detector's, the others from that of
-    the run.
-    """
-
-    def on_event(self, event: Event, arrival_ns: int) -> None:
-        """What the engine has just taken, in this order, and when it arrived."""
-        ...
-
-    def on_step(self, step: LiveStep, now_ns: int) -> None:
-        """An instant has been solved."""
-        ...
-
-    def on_image(self, image: CameraImage) -> None:
-        """Goes to the detector now."""
-        ...
-
-    def on_status(self, status: LiveStatus) -> None:
-        """Once a second."""
-        ...
-
-    def close(self) -> None:
-        """The run is over, or the listener is no longer wanted; may wait for a moment."""
-        ...
-
-
-@runtime_checkable
-class Sending(Protocol):
-    """A listener that sends poses on."""
-
-    def stream_statuses(self) -> Sequence[StreamStatus]:
-        """How each of its streams goes."""
-        ...
-
-    @property
-    def poses(self) -> float:
-        """Instants sent so far."""
-        ...
-
-
-@runtime_checkable
-class Recording(Protocol):
-    """A listener that writes a file."""
-
-    def status(self) -> RecordingStatus:
-        """How it goes."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -145,9 +91,7 @@ class LiveRun:
         self._engine = engine or Engine(setup)
         self._inbox = Inbox(self.clock)
         self._inputs = inputs_of(setup)
-        self._listeners = tuple(listeners)
-        self._broken: list[Listener] = []
-        self._recordings: list[RecordingStatus] = []
+        self._listeners = Listeners(listeners, self.incidents.add)
         self._refused: set[str] = set()
         self._feed_of: dict[Key, Feed] = {}
         self._lateness: deque[tuple[int, int]] = deque([(0, 0)], maxlen=_ROLL_S + 1)
@@ -156,7 +100,6 @@ class LiveRun:
         self._begun_ns = self._end_ns = self.clock.now_ns()
         self._ended_ns: int | None = None
         self._threads_left: tuple[str, ...] = ()
-        self._changing = threading.Lock()
         self._stopping = threading.Event()
         self._load = ProcessLoad()
         self._feeds = [Feed(source, self._deliver, self.incidents) for source in sources]
@@ -167,7 +110,7 @@ class LiveRun:
                 detector,
                 len(setup.rig),
                 emit=self._inbox.put,
-                show=lambda image: self._tell("on_image", image),
+                show=lambda image: self._listeners.tell("on_image", image),
                 clock=self.clock,
                 latency=self.latency,
                 incidents=self.incidents,
@@ -181,8 +124,8 @@ class LiveRun:
             eager=self.eager,
             clock=self.clock,
             latency=self.latency,
-            on_event=lambda event, arrival_ns: self._tell("on_event", event, arrival_ns),
-            on_step=lambda step, now_ns: self._tell("on_step", step, now_ns),
+            on_event=lambda event, arrival_ns: self._listeners.tell("on_event", event, arrival_ns),
+            on_step=lambda step, now_ns: self._listeners.tell("on_step", step, now_ns),
             expect=self._detection.expect if self._detection else None,
             failed=self._engine_failed,
         )
@@ -194,6 +137,8 @@ class LiveRun:
         """Until stopped, until every source has ended, or for so long; then closes listeners."""
         self.begun = True
         self._begun_ns = self.clock.now_ns()
+        self._sent.clear()
+        self._sent.append((self._begun_ns, 0.0))
         with _undisturbed():
             try:
                 self._solving.start()
@@ -212,8 +157,7 @@ class LiveRun:
 
     def close(self) -> None:
         """Close listeners of a run that never began."""
-        for listener in self._listeners:
-            self._close(listener)
+        self._listeners.close()
 
     def submit(self, command: Command) -> None:
         """A user's wish, to be taken before the next instant; from any thread."""
@@ -221,14 +165,11 @@ class LiveRun:
 
     def add_listener(self, listener: Listener) -> None:
         """Takes part from the next event on."""
-        with self._changing:
-            self._listeners = (*self._listeners, listener)
+        self._listeners.add(listener)
 
     def remove_listener(self, listener: Listener) -> None:
         """Takes no more part, and is closed."""
-        with self._changing:
-            self._listeners = tuple(one for one in self._listeners if one is not listener)
-        self._close(listener)
+        self._listeners.remove(listener)
 
     def status(self) -> LiveStatus:
         """As of the last second."""
@@ -245,7 +186,7 @@ class LiveRun:
             if now_ns >= next_status_ns:
                 next_status_ns += 1_000_000_000 * (1 + (now_ns - next_status_ns) // 1_000_000_000)
                 self._status = self._make_status(now_ns)
-                self._tell("on_status", self._status)
+                self._listeners.tell("on_status", self._status)
             if seconds is not None and now_ns - self._begun_ns >= 1e9 * seconds:
                 return
             if self._feeds and all(feed.finished for feed in self._feeds):
@@ -267,8 +208,7 @@ class LiveRun:
         deadline_s = time.monotonic() + _JOIN_S
         left = [one for one in threads if not one.join(max(0.0, deadline_s - time.monotonic()))]
         self._threads_left = tuple(one.name for one in left)
-        for listener in self._listeners:
-            self._close(listener)
+        self._listeners.close()
 
     def _deliver(self, item: Delivery, feed: Feed) -> None:
         now_ns = self.clock.now_ns()
@@ -299,39 +239,13 @@ class LiveRun:
             "report it with the recording"
         )
 
-    # Listeners
-
-    def _tell(self, method: str, *args: object) -> None:
-        for listener in self._listeners:
-            try:
-                getattr(listener, method)(*args)
-            except Exception as error:  # a broken listener must not end the run
-                self.incidents.add(
-                    f"{type(listener).__name__} failed and is left out: "
-                    f"{type(error).__name__}: {error}"
-                )
-                with self._changing:
-                    self._listeners = tuple(one for one in self._listeners if one is not listener)
-                self._broken.append(listener)
-
-    def _close(self, listener: Listener) -> None:
-        try:
-            listener.close()
-        except Exception as error:  # the others are still to be closed
-            self.incidents.add(
-                f"{type(listener).__name__} did not close: {type(error).__name__}: {error}"
-            )
-        if (status := _recording(listener)) is not None:
-            self._recordings.append(status)
-
     # What is shown
 
     def _note_changes(self, now_ns: int) -> None:
         """One incident for all that were lost since the last look, one for all that are back."""
         while self._engine.notes:
             self.incidents.add(self._engine.notes.popleft())
-        while self._broken:
-            self._close(self._broken.pop())
+        self._listeners.close_broken()
         changes: dict[str, list[str]] = {}
         for key, source in self._inputs.items():
             feed = self._feed_of.get(key)
@@ -351,10 +265,8 @@ class LiveRun:
             (solving.late + solving.skipped, solving.solves.total + solving.skipped)
         )
         (late_before, before), (late, instants) = self._lateness[0], self._lateness[-1]
-        senders = [one for one in self._listeners if isinstance(one, Sending)]
-        self._sent.append((now_ns, _mean([sender.poses for sender in senders])))
+        self._sent.append((now_ns, self._listeners.poses))
         (sent_before_ns, sent_before), (_, sent) = self._sent[0], self._sent[-1]
-        recordings = [status for one in self._listeners if (status := _recording(one))]
         return LiveStatus(
             elapsed_s=1e-9 * (now_ns - self._begun_ns),
             detections_per_s=self._detections_per_s(now_ns),
@@ -363,8 +275,8 @@ class LiveRun:
             late_share=(late - late_before) / max(instants - before, 1),
             sources=self._sources(now_ns),
             latency=self.latency.window(),
-            streams=tuple(one for sender in senders for one in sender.stream_statuses()),
-            recording=recordings[-1] if recordings else None,
+            streams=self._listeners.stream_statuses(),
+            recording=self._listeners.recording_status(),
             incidents=self.incidents.all()[-_SHOWN:],
             cpu_share=self._load.recent_cpu_share(),
             memory_mb=self._load.memory_mb(),
@@ -394,7 +306,6 @@ class LiveRun:
         detections = (
             sum(one.meter.total for one in cameras) if detection is None else detection.rounds.total
         )
-        senders = [one for one in self._listeners if isinstance(one, Sending)]
         return LiveReport(
             simulated=self.setup.simulated,
             elapsed_s=elapsed_s,
@@ -409,14 +320,14 @@ class LiveRun:
             detections=detections,
             detections_per_s=detections / elapsed_s,
             detector_failures=detection.failures if detection else 0,
-            packets_per_s=_mean([sender.poses for sender in senders]) / elapsed_s,
+            packets_per_s=self._listeners.poses / elapsed_s,
             events_dropped=self._inbox.dropped,
             latency=self.latency.total(),
             subjects=subject_reports(solving.people, instants),
             inputs=self._sources(self._end_ns),
             sources=tuple(feed.report() for feed in self._feeds),
-            streams=tuple(one for sender in senders for one in sender.stream_statuses()),
-            recordings=tuple(self._recordings),
+            streams=self._listeners.stream_statuses(),
+            recordings=tuple(self._listeners.recorded),
             incidents=self.incidents.all(),
             incident_count=self.incidents.count,
             cpu_share=self._load.cpu_share(),
@@ -424,15 +335,6 @@ class LiveRun:
             memory_peak_mb=self._load.peak_mb,
             threads_left=self._threads_left,
         )
-
-
-def _recording(listener: Listener) -> RecordingStatus | None:
-    status = listener.status() if isinstance(listener, Recording) else None
-    return status if isinstance(status, RecordingStatus) else None
-
-
-def _mean(values: Sequence[float]) -> float:
-    return sum(values) / len(values) if values else 0.0
 
 
 @contextmanager
