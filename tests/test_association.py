@@ -177,6 +177,17 @@ def test_skeleton_of_impossible_size_is_refused():
     assert not anatomy.possible(body[None])[0]
 
 
+def test_centre_is_that_of_the_torso_or_of_what_is_there():
+    body = six_people()[0][0]
+    torso = np.isin(BODY25.landmark_names, ["neck", "mid_hip", "left_hip", "right_hip"])
+    torso |= np.isin(BODY25.landmark_names, ["left_shoulder", "right_shoulder"])
+    anatomy = Anatomy(BODY25)
+    np.testing.assert_allclose(anatomy.centre(body), body[torso].mean(axis=0))
+    body[torso] = np.nan
+    np.testing.assert_allclose(anatomy.centre(body), body[~torso].mean(axis=0))
+    assert np.isnan(anatomy.centre(np.full_like(body, np.nan))).all()
+
+
 # ------------------------------------------------------------------------------------- the tracker
 
 
@@ -438,3 +449,11 @@ def test_algorithm_1_coasts_while_nobody_is_seen(rng):
     nobody = Detections(timestamp_ns=1, people=(np.zeros((0, 25, 3)),) * 4)
     (update,) = sorter.update(nobody, {}, 1)
     assert update.state is TrackState.COASTING and np.all(update.person == -1)
+
+
+def test_algorithm_1_reports_subjects_after_one_who_is_not_there_yet(rng):
+    rig = ring_of_cameras(4)
+    subjects = [Subject(name="ann", start_m=(9.0, 9.0)), Subject(name="bob", start_m=(3.0, -0.75))]
+    scene = observe(rig, two_who_pass(1.5), rng)
+    updates = PaperSorter(rig, BODY25, subjects).update(scene.detections[0], {}, 0)
+    assert [update.name for update in updates] == ["bob"]

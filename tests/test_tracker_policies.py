@@ -141,15 +141,33 @@ def test_whom_only_two_of_the_views_detect_becomes_a_subject_after_a_second():
     assert reported[:30] == [[]] * 30 and len(reported[31]) == 1
 
 
-def test_person_who_jumps_out_of_the_gate_is_found_again_at_once():
+def test_newcomer_unseen_for_half_a_second_begins_its_trial_again():
+    stage = Stage(Tracker(RIG, BODY25))
+    stage.hold(2 / RATE_HZ, SOMEBODY)
+    stage.hold(0.6)
+    (update,) = stage.show(SOMEBODY)
+    assert update.state is TrackState.TENTATIVE
+
+
+def test_outage_longer_than_the_memory_ends_every_track():
+    stage = Stage(Tracker(RIG, BODY25, TrackerOptions(coast_s=1.0, memory_s=1.0)))
+    stage.hold(0.5, SOMEBODY)
+    reported = [len(stage.show(left=-1)) for _ in range(70)]
+    assert reported[:58] == [1] * 58 and reported[-1] == 0
+
+
+@pytest.mark.parametrize(
+    "found", [aside(*0.52 * BESIDE), of_size(0.82) + 0.4 * (aside(*BESIDE) - SOMEBODY)]
+)
+def test_person_who_jumps_out_of_the_gate_is_found_again_at_once(found):
     stage = Stage(Tracker(RIG, BODY25))
     stage.hold(0.5, SOMEBODY)
-    (update,) = stage.show(aside(*0.52 * BESIDE))
+    (update,) = stage.show(found)
     assert update.state is TrackState.CONFIRMED and np.all(update.person == 0)
 
 
 @pytest.mark.parametrize(
-    "other", [aside(*1.0 * BESIDE), of_size(0.65) + aside(*0.4 * BESIDE) - SOMEBODY]
+    "other", [aside(*1.0 * BESIDE), of_size(0.65) + aside(*0.3 * BESIDE) - SOMEBODY]
 )
 def test_somebody_too_far_or_of_another_size_does_not_continue_a_track(other):
     stage = Stage(Tracker(RIG, BODY25))
@@ -199,7 +217,7 @@ def test_bystander_keeps_a_detection_that_fits_it_better_than_the_subject():
 
 
 ACROSS = np.array([np.cos(0.3), -np.sin(0.3)])
-"""The direction on the floor in which the first camera sees somebody move sideways."""
+"""The direction on the floor in which the first and third camera see somebody move sideways."""
 
 
 def test_track_that_one_view_shows_goes_along_sideways():
@@ -207,11 +225,12 @@ def test_track_that_one_view_shows_goes_along_sideways():
     stage.hold(0.5, SOMEBODY)
     for step in np.linspace(0.0, 1.5, 45):
         upper = aside(*step * ACROSS)
-        upper[upper[:, 1] < 1.0] = np.nan
-        (update,) = stage.show(upper, unseen_by=(1, 2, 3))
-        np.testing.assert_array_equal(update.person, [0, -1, -1, -1])
-    (update,) = stage.show(aside(*1.5 * ACROSS))
-    np.testing.assert_array_equal(update.person, 0)
+        upper[upper[:, 1] < 1.2] = np.nan
+        (update,) = stage.show(upper, unseen_by=(0, 1, 3))
+        np.testing.assert_array_equal(update.person, [-1, -1, 0, -1])
+    # What that view did not see went along with the rest.
+    (update,) = stage.show(aside(*1.5 * ACROSS), unseen_by=(0, 1, 3))
+    np.testing.assert_array_equal(update.person, [-1, -1, 0, -1])
 
 
 def test_only_camera_left_finds_a_subject_again_beyond_the_gate():
