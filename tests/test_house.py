@@ -10,6 +10,7 @@ import fusecap.export.formats as exports
 import fusecap.motion.files as motions
 import fusecap.sources.calibration_files.formats as calibrations
 import fusecap.sources.imu_files.formats as imus
+import fusecap.sources.imu_streams as sensors
 import fusecap.streams.protocols as protocols
 
 
@@ -18,6 +19,7 @@ import fusecap.streams.protocols as protocols
     [
         (exports, exports.FORMATS),
         (protocols, protocols.NAMES),
+        (sensors, sensors.NAMES),
         (imus, [name.replace("-", "_") for name in imus.NAMES]),
         (calibrations, calibrations.NAMES),
         (motions, motions.NAMES),

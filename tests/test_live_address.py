@@ -1,10 +1,8 @@
-import pkgutil
 from pathlib import Path
 
 import pytest
 
 from fusecap.errors import InputError, SessionError
-from fusecap.sources import imu_streams
 from fusecap.sources.imu_streams.mvn import SEGMENTS
 from fusecap.sources.live_address import (
     Capture,
@@ -155,8 +153,3 @@ def test_segment_identities_are_those_of_the_published_table():
     assert [SEGMENTS.index(n) for n in ("Head", "RightHand", "LeftHand", "LeftToe")] == [
         *(6, 10, 14, 22)
     ]
-
-
-def test_every_module_of_a_sensor_protocol_stands_in_the_table():
-    modules = {module.name for module in pkgutil.iter_modules(imu_streams.__path__)}
-    assert modules == set(imu_streams.NAMES)

@@ -7,7 +7,6 @@ left shoulder 0.195 m to the left at 1.636 m, the wrist 0.664 m further out, the
 from __future__ import annotations
 
 import json
-import pkgutil
 import struct
 
 import numpy as np
@@ -18,7 +17,6 @@ from pythonosc.osc_bundle import OscBundle
 from scipy.spatial.transform import Rotation
 
 from fusecap.body.skeleton import EXTENDED23, PAPER21
-from fusecap.streams import protocols
 from fusecap.streams.osc_packets import bundles, message
 from fusecap.streams.person_pose import pose_of_estimate, pose_of_take, with_clavicles
 from fusecap.streams.protocols.livelink import livelink_datagrams
@@ -516,9 +514,3 @@ def test_untracked_frame_of_a_take_has_no_pose():
     assert pose_of_take(take, 0, 1) is None
     pose = pose_of_take(take, 0, 2)
     assert pose is not None and pose.timestamp_ns == take.timestamps_ns[2]
-
-
-def test_every_module_of_a_protocol_stands_in_the_table():
-    modules = {module.name for module in pkgutil.iter_modules(protocols.__path__)}
-    assert modules == set(protocols.NAMES)
-    assert {protocols.protocol_named(name).serves for name in protocols.NAMES} == {True, False}

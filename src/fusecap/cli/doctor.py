@@ -29,9 +29,10 @@ def doctor(
     from dataclasses import asdict
 
     from fusecap.doctor import diagnose, diagnose_recording
+    from fusecap.recording.layout import SUFFIX
 
     with progress(quiet=as_json) as show:
-        check = diagnose_recording if session.suffix == ".mcap" else diagnose
+        check = diagnose_recording if session.suffix == SUFFIX else diagnose
         findings = check(session, show)
     errors = sum(finding.severity == "error" for finding in findings)
     if as_json:

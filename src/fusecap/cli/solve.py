@@ -68,12 +68,13 @@ def solve(
     from fusecap.batch.solve import solve_session
     from fusecap.cli.detect import detect_missing, print_detection
     from fusecap.files import safe_name
+    from fusecap.recording.layout import SUFFIX
     from fusecap.sources.session import load_session
     from fusecap.sources.session_data import open_session
 
     formats = _formats(export)
     check_choice("--unit", unit, ("m", "cm"))
-    if session.suffix == ".mcap":
+    if session.suffix == SUFFIX:
         _solve_recording(
             session, out, formats, unit, picture=picture, as_live=as_live, quiet=as_json
         )
