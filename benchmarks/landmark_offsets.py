@@ -30,8 +30,8 @@ from fusecap.calibrate.offsets import (
     median_offsets,
     self_calibrate,
 )
+from fusecap.evaluate.datasets.shelf import load_truth, score_people
 from fusecap.evaluate.score import score_take
-from fusecap.evaluate.shelf import score_shelf
 from fusecap.evaluate.simulated_solve import solve_simulation
 from fusecap.evaluate.simulator import Simulation
 from fusecap.evaluate.twin import (
@@ -155,7 +155,7 @@ def shelf(folder: Path, first: int = 150, end: int = 301) -> None:
         print(f"training reprojection {error} px")
         _print_moves(found.landmarks)
         for name, each in (("defaults", landmarks), ("self-calibrated", found.landmarks)):
-            score = score_shelf(take(each, 0, first), folder / TRUTH)
+            score = score_people(take(each, 0, first), load_truth(folder / TRUTH))
             limbs = ", ".join(f"{kind} {pcp:.1f}" for kind, pcp in score.limb_pcp.items())
             print(f"{name:16} PCP {score.pcp:.2f} on frames 0-{first - 1} ({limbs}); ", end="")
             print(f"{score.identity_switches} switches, {score.missed_person_frames} missed")

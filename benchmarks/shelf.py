@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 
 from fusecap.batch.solve import solve_session
-from fusecap.evaluate.shelf import ShelfScore, score_shelf
+from fusecap.evaluate.datasets.shelf import ShelfScore, load_truth, score_people
 from fusecap.sources.session import load_session
 from fusecap.sources.session_data import open_session
 from fusecap.take import Take, save_take
@@ -78,7 +78,7 @@ def main() -> None:
         save_take(take, arguments.out)
     people = len(take.subject_names)
     print(f"{arguments.frames} frames, {people} people, {time.perf_counter() - started:.1f} s")
-    print(table(score_shelf(take, arguments.folder / TRUTH)))
+    print(table(score_people(take, load_truth(arguments.folder / TRUTH))))
 
 
 if __name__ == "__main__":

@@ -17,8 +17,8 @@ from fusecap.evaluate.datasets import human36m, panoptic, shelf, total_capture
 from fusecap.evaluate.datasets.dip import load_dip
 from fusecap.evaluate.datasets.safe_pickle import load_pickle
 from fusecap.evaluate.datasets.score import mean_by_name, score_table, score_truth
+from fusecap.evaluate.datasets.shelf import score_people
 from fusecap.evaluate.demo_scene import demo_scene
-from fusecap.evaluate.shelf import score_people
 from fusecap.evaluate.simulated_session import write_session
 from fusecap.geometry.camera import Y_UP_FROM_Z_UP
 from motions import person, take_of

@@ -12,8 +12,8 @@ from fusecap.body.prior import PosePrior, load_prior, save_prior
 from fusecap.body.shape import BodyShape
 from fusecap.body.skeleton import EXTENDED23, PAPER21
 from fusecap.errors import InputError, MotionError
-from fusecap.motion.demo_motion import CLIPS
 from fusecap.motion.retarget import sole_heights_m
+from fusecap.motion.shipped import DEMO_CLIPS
 from fusecap.motion.train_prior import ACKNOWLEDGEMENT, mirrored, train_prior
 from motion_texts import amc_text, asf_text
 
@@ -172,7 +172,7 @@ def test_arrays_of_another_skeleton_are_refused():
 def test_the_demo_never_trained_the_prior():
     trained = load_prior(PAPER21).recipe["training_takes"]
     assert isinstance(trained, list)
-    assert not {clip.take for clip in CLIPS} & set(trained)
+    assert not {clip.take for clip in DEMO_CLIPS} & set(trained)
 
 
 def test_the_demo_stands_on_the_floor_and_keeps_apart():

@@ -9,7 +9,7 @@ import pytest
 
 from fusecap.batch.solve import solve_session
 from fusecap.doctor import diagnose
-from fusecap.evaluate.shelf import score_shelf
+from fusecap.evaluate.datasets.shelf import load_truth, score_people
 from fusecap.sources.session import load_session
 from fusecap.sources.session_data import open_session
 
@@ -77,6 +77,6 @@ def test_shelf_is_solved_without_a_constant_of_its_own(data_dir, tmp_path):
     shelf = script("benchmarks/shelf.py")
     folder = data_dir / "shelf"
     path = shelf.write_shelf_session(folder, tmp_path, frames=150, floor=True)
-    score = score_shelf(solve(path).take, folder / shelf.TRUTH)
+    score = score_people(solve(path).take, load_truth(folder / shelf.TRUTH))
     assert score.pcp >= 98
     assert score.identity_switches == 0 and score.missed_person_frames == 0

@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 
 from fusecap.errors import InputError
-from fusecap.evaluate.metrics import position_error_m
-from fusecap.evaluate.shelf import (
+from fusecap.evaluate.datasets.shelf import (
     CHIN,
     HEAD_TOP,
     MID_HIP,
     frame_numbers,
     load_truth,
-    score_shelf,
+    score_people,
     shelf_points,
 )
+from fusecap.evaluate.metrics import position_error_m
 from fusecap.evaluate.simulator import placed
 from fusecap.geometry.camera import Y_UP_FROM_Z_UP
 from motions import person, take_of, walk
@@ -60,7 +60,7 @@ def test_truth_reads_back_in_our_world(two, truth_path):
 
 
 def test_perfect_take_has_all_limbs_right(two, truth_path):
-    score = score_shelf(take_with(two, ("a", "b")), truth_path)
+    score = score_people(take_with(two, ("a", "b")), load_truth(truth_path))
     assert score.pcp == 100.0
     assert score.actor_pcp == {0: 100.0, 2: 100.0}
     assert set(score.limb_pcp.values()) == {100.0}
@@ -70,12 +70,14 @@ def test_perfect_take_has_all_limbs_right(two, truth_path):
 
 def test_order_and_strangers_do_not_matter(two, truth_path):
     stranger = placed(two[0], centre_m=(4.0, 4.0))
-    score = score_shelf(take_with([stranger, two[1], two[0]], ("x", "y", "z")), truth_path)
+    score = score_people(
+        take_with([stranger, two[1], two[0]], ("x", "y", "z")), load_truth(truth_path)
+    )
     assert score.pcp == 100.0
 
 
 def test_missed_person_is_ten_wrong_limbs(two, truth_path):
-    score = score_shelf(take_with(two[:1], ("a",)), truth_path)
+    score = score_people(take_with(two[:1], ("a",)), load_truth(truth_path))
     assert score.actor_pcp == {0: 100.0, 2: 0.0}
     assert (score.pcp, score.missed_person_frames) == (50.0, FRAMES)
 
@@ -84,7 +86,7 @@ def test_frames_the_take_lacks_are_missed(two, truth_path):
     part = take_with([theta[5:] for theta in two], ("a", "b"))
     part = replace(part, timestamps_ns=part.timestamps_ns + 5 * 40_000_000)
     assert frame_numbers(part)[0] == 5
-    score = score_shelf(part, truth_path)
+    score = score_people(part, load_truth(truth_path))
     assert score.pcp == pytest.approx(100.0 * 15 / 20)
     assert score.missed_person_frames == 10
 
@@ -96,14 +98,14 @@ def test_take_without_people_scores_nothing(two, truth_path):
         tracked=np.zeros_like(take.tracked),
         bone_position_in_world_m=np.full_like(take.bone_position_in_world_m, np.nan),
     )
-    score = score_shelf(none, truth_path)
+    score = score_people(none, load_truth(truth_path))
     assert (score.pcp, score.missed_person_frames) == (0.0, 2 * FRAMES)
 
 
 def test_wrong_arm_is_one_wrong_limb_and_its_neighbours_stay_right(two, truth_path):
     bent = two[0].copy()
     bent[:, 3 + 3 * person().skeleton.bone("left_forearm") + 1] += 2.5
-    score = score_shelf(take_with([bent, two[1]], ("a", "b")), truth_path)
+    score = score_people(take_with([bent, two[1]], ("a", "b")), load_truth(truth_path))
     assert score.actor_pcp == {0: 90.0, 2: 100.0}
     assert score.limb_pcp["lower arms"] == 75.0
     assert score.limb_pcp["upper arms"] == 100.0
@@ -112,14 +114,14 @@ def test_wrong_arm_is_one_wrong_limb_and_its_neighbours_stay_right(two, truth_pa
 def test_swapped_people_are_switches_and_right_limbs(two, truth_path):
     swapped = [two[0].copy(), two[1].copy()]
     swapped[0][10:], swapped[1][10:] = two[1][10:], two[0][10:]
-    score = score_shelf(take_with(swapped, ("a", "b")), truth_path)
+    score = score_people(take_with(swapped, ("a", "b")), load_truth(truth_path))
     assert (score.pcp, score.identity_switches) == (100.0, 2)
 
 
 def test_actor_three_is_not_scored(tmp_path, two):
     points = shelf_points(take_with(two, ("a", "b")))
     path = write_truth(tmp_path / "gt.txt", {0: points[0], 3: points[1] + 50.0})
-    score = score_shelf(take_with(two, ("a", "b")), path)
+    score = score_people(take_with(two, ("a", "b")), load_truth(path))
     assert score.actor_pcp == {0: 100.0}
 
 
@@ -127,7 +129,7 @@ def test_actor_counts_in_the_frames_that_show_it(tmp_path, two):
     points = shelf_points(take_with(two, ("a", "b")))
     present = {0: range(FRAMES), 1: range(4)}
     path = write_truth(tmp_path / "gt.txt", {0: points[0], 1: points[1]}, present)
-    score = score_shelf(take_with(two, ("a", "b")), path)
+    score = score_people(take_with(two, ("a", "b")), load_truth(path))
     assert (score.pcp, score.person_frames) == (100.0, FRAMES + 4)
 
 

@@ -26,8 +26,8 @@ from fusecap.evaluate.twin import (
     twin_simulation,
     twin_training_sequences,
 )
+from fusecap.motion.shipped import TEST_CLIPS, TRAINING_CLIPS
 from fusecap.motion.train_prior import CMU_HELD_OUT
-from fusecap.motion.twin_motion import TEST_CLIPS, TRAINING_CLIPS
 
 
 def test_eight_sequences_of_five_subjects_of_ten_seconds():

@@ -27,8 +27,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from shelf import CAMERAS, TRUTH, solve_shelf
 
+from fusecap.evaluate.datasets.shelf import ACTORS, LIMBS, load_truth, score_people
 from fusecap.evaluate.metrics import correct_limbs, identity_switches, match_people
-from fusecap.evaluate.shelf import ACTORS, LIMBS, load_truth, score_shelf
 
 FRAMES = 150
 _LEGS = ("RAnkle", "RKnee", "RHip", "LHip", "LKnee", "LAnkle")
@@ -55,7 +55,7 @@ BODY25_TREE = {
     }
 }
 HEAD_FORWARD_M, HEAD_UP_M = 0.125, 0.145
-"""See fusecap.evaluate.shelf."""
+"""See fusecap.evaluate.datasets.shelf."""
 
 
 def write_project(folder: Path, target: Path) -> None:
@@ -120,7 +120,7 @@ def read_people(paths: list[Path]) -> np.ndarray:
 
 
 def score(people: np.ndarray, truth_path: Path) -> tuple[float, dict[int, float], int]:
-    """PCP by the rules of fusecap.evaluate.shelf: mean, per actor; identity switches."""
+    """PCP by the rules of fusecap.evaluate.datasets.shelf: mean, per actor; identity switches."""
     # From our y up (x, z, -y) to the TRC's (y, z, x): only distances count, but axes must agree.
     truth = load_truth(truth_path).points_in_world_m
     actors = [actor for actor in ACTORS if actor < len(truth)]
@@ -166,7 +166,8 @@ def main() -> None:
         raw = [path for path in files if "_filt" not in path.name]
         triangulated, smoothed = score(read_people(raw), truth), score(read_people(filtered), truth)
     wall, processor = time.perf_counter(), time.process_time()
-    ours = score_shelf(solve_shelf(arguments.folder, frames=FRAMES, floor=True), truth)
+    take = solve_shelf(arguments.folder, frames=FRAMES, floor=True)
+    ours = score_people(take, load_truth(truth))
     wall, processor = time.perf_counter() - wall, time.process_time() - processor
 
     stages = report["seconds"]

@@ -118,8 +118,12 @@ def human36m(
 
 def shelf(folder: Folder, out: Out = _OUT, as_json: Json = False) -> None:
     """Shelf or Campus: 3D PCP per actor and kind of limb."""
-    from fusecap.evaluate.datasets.shelf import load_shelf, load_shelf_truth, pcp_table
-    from fusecap.evaluate.shelf import score_people
+    from fusecap.evaluate.datasets.shelf import (
+        load_shelf,
+        load_shelf_truth,
+        pcp_table,
+        score_people,
+    )
 
     truth = load_shelf_truth(folder)
     recording = load_shelf(folder)

@@ -10,8 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from fusecap.evaluate.cells import solve_cell
-from fusecap.evaluate.experiments.bars import bars
-from fusecap.evaluate.experiments.experiment import Experiment, Finding, Report, Results, Settings
+from fusecap.evaluate.experiments.experiment import (
+    Experiment,
+    Finding,
+    Report,
+    Results,
+    Settings,
+    bars,
+)
 from fusecap.evaluate.experiments.figure7 import FIGURE7
 from fusecap.evaluate.experiments.figure9 import FIGURE9
 from fusecap.evaluate.experiments.figure10 import FIGURE10

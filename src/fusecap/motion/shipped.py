@@ -1,18 +1,48 @@
-"""Make the motion of the twin (`fusecap.evaluate.twin`): ten seconds each of 19 takes.
+"""The clips that fusecap ships as motion, and how their files are made again.
 
-`TEST_CLIPS` come from takes that neither trained the pose prior nor serve any tuning;
-`TRAINING_CLIPS` from takes that trained the prior. Names are "subject name".
+    python -m fusecap.motion.shipped CMU_FOLDER OUT_FOLDER
+
+writes `demo_motion.npz` (twelve seconds of takes that the pose prior never saw) and
+`twin_motion.npz` (ten seconds each of 19 takes, `fusecap.evaluate.twin`). Names of the twin's clips
+are "subject name"; `TEST_CLIPS` come from takes that neither trained the prior nor serve any
+tuning, `TRAINING_CLIPS` from takes that trained it.
 """
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
 
 from fusecap.motion.clips import Clip, save_clips
 
-DURATION_S = 10.0
+DEMO_CLIPS = (
+    Clip(
+        name="basketball",
+        take="bvh/06_12",
+        start_s=0.0,
+        speed=0.81,
+        heading_deg=35.0,
+        centre_m=(0.0, 0.0),
+    ),
+    Clip(
+        name="traffic",
+        take="expmap/train/directing_traffic/directing_traffic_4",
+        start_s=13.0,
+        speed=1.0,
+        heading_deg=-60.0,
+        centre_m=(1.0, -0.1),
+    ),
+    Clip(
+        name="bystander",
+        take="expmap/train/walking_extra/walking_50",
+        start_s=0.0,
+        speed=0.87,
+        heading_deg=0.0,
+        centre_m=(-3.0, 0.0),
+    ),
+)
 
 TEST_CLIPS = (
     Clip(name="S1 FS3", take="asfamc/03/03_03", start_s=20.0),
@@ -42,7 +72,12 @@ TRAINING_CLIPS = (
 )
 
 
-def make_twin_motion(motion_folder: Path, path: Path) -> None:
-    """Write the coefficients of all clips, taken from the CMU archives in `motion_folder`."""
-    clips = (*TEST_CLIPS, *TRAINING_CLIPS)
-    save_clips(motion_folder, path, clips, duration_s=DURATION_S, precision=np.float16)
+def main(motion_folder: Path, out: Path) -> None:
+    """Both files, from the CMU archives in `motion_folder`; raises `InputError`."""
+    save_clips(motion_folder, out / "demo_motion.npz", DEMO_CLIPS, duration_s=12.0)
+    twin = (*TEST_CLIPS, *TRAINING_CLIPS)
+    save_clips(motion_folder, out / "twin_motion.npz", twin, duration_s=10.0, precision=np.float16)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2]))
