@@ -157,7 +157,7 @@ def test_outage_longer_than_the_memory_ends_every_track():
 
 
 @pytest.mark.parametrize(
-    "found", [aside(*0.52 * BESIDE), of_size(0.82) + 0.4 * (aside(*BESIDE) - SOMEBODY)]
+    "found", [aside(*0.52 * BESIDE), of_size(0.75) + 0.44 * (aside(*BESIDE) - SOMEBODY)]
 )
 def test_person_who_jumps_out_of_the_gate_is_found_again_at_once(found):
     stage = Stage(Tracker(RIG, BODY25))
