@@ -37,7 +37,8 @@ from fusecap.cli import (
     stream,
     view,
 )
-from fusecap.cli.common import err, print_json
+from fusecap.cli.common import print_json
+from fusecap.cli.terminal import err, remark
 from fusecap.errors import FusecapError
 
 app = typer.Typer(
@@ -130,6 +131,5 @@ def _say_interrupted() -> None:
 def _fail(message: str) -> None:
     if "--json" in sys.argv:
         print_json({"error": message})
-    err.print("[bold red]error[/] ", end="")
-    err.print(message, markup=False, soft_wrap=True)
+    remark(("error", "bold red"), message)
     sys.exit(1)

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from fusecap.cli.common import Json, check_choice, console, print_json
-from fusecap.cli.lengths import length_m
+from fusecap.cli.common import Json, check_choice, length_m, print_json
+from fusecap.cli.terminal import console
 
 EXAMPLE = "Example: fusecap calibrate board --columns 7 --rows 5 --square 34mm --out board.pdf"
 
@@ -85,7 +85,6 @@ def board(
     console.print(
         f"{target.words}: square {1e3 * square_m:g} mm, {len(target.corners_in_board_m)} corners, "
         f"on {sheet.name} ({page_mm[0]:g} x {page_mm[1]:g} mm)",
-        markup=False,
         soft_wrap=True,
     )
     if target.ambiguous:
@@ -93,7 +92,7 @@ def board(
             "note: it looks the same after half a turn; make columns + rows odd to tell its ends",
             soft_wrap=True,
         )
-    console.print(f"wrote {out}\nwrote {toml}", markup=False, soft_wrap=True)
+    console.print(f"wrote {out}\nwrote {toml}", soft_wrap=True)
     console.print(
         f"print at 100 %, check that the ruler is {board_drawing.RULER_MM:g} mm long, glue it flat",
         soft_wrap=True,

@@ -11,11 +11,11 @@ from fusecap.cli import calibrate_from_people
 from fusecap.cli.calibrate_intrinsics import Every
 from fusecap.cli.calibrations import (
     named_sources,
-    print_files,
     print_verdict,
     write_report,
 )
-from fusecap.cli.common import Json, console, err, print_json, progress
+from fusecap.cli.common import Json, print_json
+from fusecap.cli.terminal import console, err, progress, table_of, wrote
 
 if TYPE_CHECKING:
     from fusecap.calibrate.cameras.board import Board
@@ -156,12 +156,11 @@ def extrinsics(
         print_json(as_dict | {"files": [str(file) for file in files]})
         return
     _print(result, refine=moving)
-    print_files(files)
+    wrote(*files)
     if origin_frame is None:
         console.print(
             "the first camera is the world; place it in the room: fusecap calibrate world "
             f"{out} --board {board} --floor CAMERA=IMAGE --out world.toml",
-            markup=False,
             soft_wrap=True,
         )
 
@@ -238,13 +237,12 @@ def _in_world(
 
 
 def _print(result: RigCalibration, *, refine: bool) -> None:
-    from rich.table import Table
 
     report = result.report
     console.print(
         "errors on held-out instants; by others: predicted from the other cameras, median"
     )
-    table = Table(
+    table = table_of(
         "camera",
         "views",
         "rms px",
@@ -278,7 +276,6 @@ def _print(result: RigCalibration, *, refine: bool) -> None:
     if left_out:
         err.print(
             f"left out, they contradict the rest: {', '.join(left_out)}",
-            markup=False,
             soft_wrap=True,
         )
     print_verdict("calibration", report.verdict, report.advice)

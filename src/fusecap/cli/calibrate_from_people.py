@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from fusecap.cli.calibrations import print_files, print_verdict
-from fusecap.cli.common import check_choice, console, print_json, progress
+from fusecap.cli.calibrations import print_verdict
+from fusecap.cli.common import check_choice, print_json
+from fusecap.cli.terminal import console, progress, table_of, wrote
 
 if TYPE_CHECKING:
     from fusecap.calibrate.cameras.people_report import PeopleCalibration
@@ -51,11 +52,10 @@ def from_people(
         print_json(_as_json(found, files))
     else:
         _print_report(found)
-        print_files(files)
+        wrote(*files)
         if found.improved:
             console.print(
                 f'use it: under [session] calibration = "{out.name}" and up = "y"',
-                markup=False,
                 soft_wrap=True,
             )
     if not found.improved:
@@ -86,7 +86,6 @@ def _change(before: float, after: float) -> str:
 
 
 def _print_report(found: PeopleCalibration) -> None:
-    from rich.table import Table
 
     console.print(
         f"{found.fit_person_instants} person-instants of {found.blocks[0]} blocks adjusted in "
@@ -94,7 +93,7 @@ def _print_report(found: PeopleCalibration) -> None:
         f"({found.block_s:.2g} s each) checked",
         soft_wrap=True,
     )
-    table = Table(
+    table = table_of(
         *("camera", "median px", "90 % px", "skeleton px", "moved mm, deg", "known mm, deg"),
         box=None,
         padding=(0, 2, 0, 0),

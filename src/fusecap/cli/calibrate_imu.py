@@ -7,16 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from fusecap.cli.calibrations import coloured, print_files
-from fusecap.cli.common import (
-    Json,
-    SessionPath,
-    check_choice,
-    console,
-    err,
-    print_json,
-    progress,
-)
+from fusecap.cli.calibrations import coloured
+from fusecap.cli.common import Json, SessionPath, check_choice, print_json
+from fusecap.cli.terminal import console, note, progress, remark, styled, table_of, wrote
 
 if TYPE_CHECKING:
     from fusecap.calibrate.imus.identify import Identity
@@ -117,15 +110,17 @@ def _report(found: tuple[SubjectCalibration, ...], out: Path, as_json: bool) -> 
 
 
 def _print_subject(found: SubjectCalibration) -> None:
-    from rich.table import Table
 
     lag = f", sensors {found.lag_s:+.2f} s late" if found.lag_s else ""
     console.print(
-        f"[bold]{found.subject}[/]: {found.duration_s:.1f} s seen{lag}; angular speeds of cameras "
-        f"and sensors correlate by {found.speed_correlation:.2f}",
+        styled(
+            (found.subject, "bold"),
+            f": {found.duration_s:.1f} s seen{lag}; angular speeds of cameras "
+            f"and sensors correlate by {found.speed_correlation:.2f}",
+        ),
         soft_wrap=True,
     )
-    table = Table(
+    table = table_of(
         "bone",
         "R_ib w x y z",
         "heading",
@@ -146,7 +141,7 @@ def _print_subject(found: SubjectCalibration) -> None:
             f"{sensor.heading_deg:.1f}",
             " ".join(f"{min(value, 180):2.0f}" for value in sensor.sigma_deg),
             f"{sensor.held_out_deg:.1f}",
-            coloured(sensor.verdict),
+            styled(coloured(sensor.verdict)),
         )
     console.print(table)
     console.print(
@@ -164,36 +159,28 @@ def _print_subject(found: SubjectCalibration) -> None:
         )
     for sensor in found.sensors:
         if abs(sensor.drift_deg_min) > max(3.0, 3.0 * sensor.drift_sigma_deg_min):
-            err.print(
-                f"[yellow]note[/] {sensor.bone}: its heading drifts by "
-                f"{sensor.drift_deg_min:.1f} deg a minute; calibrate again for later recordings",
-                soft_wrap=True,
+            note(
+                f"{sensor.bone}: its heading drifts by "
+                f"{sensor.drift_deg_min:.1f} deg a minute; calibrate again for later recordings"
             )
         if sensor.share < 0.9:
-            err.print(
-                f"[yellow]note[/] {sensor.bone}: its samples cover {100 * sensor.share:.0f} % of "
-                "what the cameras saw",
-                soft_wrap=True,
+            note(
+                f"{sensor.bone}: its samples cover {100 * sensor.share:.0f} % of "
+                "what the cameras saw"
             )
-    advice: dict[tuple[str, str], list[str]] = {}
+    advice: dict[tuple[tuple[str, str], str], list[str]] = {}
     for sensor in found.sensors:
         if sensor.remedy:
             why = f"{sensor.fault}; {sensor.remedy}"
             advice.setdefault((coloured(sensor.verdict), why), []).append(sensor.bone)
     for (verdict, why), bones in advice.items():
-        err.print(f"{verdict} {', '.join(bones)}:", end=" ")
-        err.print(why, markup=False, soft_wrap=True)
+        remark(verdict, f"{', '.join(bones)}: {why}")
     for sensor in found.skipped:
-        err.print(
-            f"[red]not calibrated[/] {sensor.bone} ({sensor.file}): {sensor.reason}",
-            soft_wrap=True,
-        )
+        remark(("not calibrated", "red"), f"{sensor.bone} ({sensor.file}): {sensor.reason}")
 
 
 def _report_identities(found: dict[str, tuple[Identity, ...]], as_json: bool) -> None:
     from dataclasses import asdict
-
-    from rich.table import Table
 
     from fusecap.calibrate.imus.identify import SURE
 
@@ -202,22 +189,22 @@ def _report_identities(found: dict[str, tuple[Identity, ...]], as_json: bool) ->
         print_json({"subjects": subjects, "sure_margin": SURE})
         return
     for name, identities in found.items():
-        console.print(f"[bold]{name}[/]")
-        table = Table("stated", "moves like", "margin", "runner-up", "speed corr.", "is it?")
+        console.print(name, style="bold")
+        table = table_of("stated", "moves like", "margin", "runner-up", "speed corr.", "is it?")
         for each in identities:
             if each.margin <= SURE:
-                told = f"[yellow]unsure: {each.found} and {each.runner_up} move alike here[/]"
+                told = f"unsure: {each.found} and {each.runner_up} move alike here", "yellow"
             elif each.found != each.stated:
-                told = f'[red]write bone = "{each.found}"[/]'
+                told = f'write bone = "{each.found}"', "red"
             else:
-                told = "[green]as stated[/]"
+                told = "as stated", "green"
             table.add_row(
                 each.stated,
                 each.found,
                 f"{each.margin:.2f}",
                 each.runner_up,
                 f"{each.speed_correlation:.2f}",
-                told,
+                styled(told),
             )
         console.print(table, soft_wrap=True)
     console.print(
@@ -252,25 +239,23 @@ def _report_tpose(found: list[tuple[CalibratedImu, TPose]], out: Path, as_json: 
 
 
 def _print_tpose(found: list[tuple[CalibratedImu, TPose]]) -> None:
-    from rich.table import Table
 
-    table = Table("subject", "bone", "R_ib w, x, y, z", "moved deg", "gravity deg", "stood")
+    table = table_of("subject", "bone", "R_ib w, x, y, z", "moved deg", "gravity deg", "stood")
     for imu, pose in found:
-        stood = "[red]" + "; ".join(pose.complaints) + "[/]" if pose.complaints else "still"
+        stood = ("; ".join(pose.complaints), "red") if pose.complaints else "still"
         table.add_row(
             imu.subject,
             imu.bone,
             " ".join(f"{value:6.3f}" for value in imu.bone_from_imu_wxyz),
             f"{pose.moved_deg:.1f}",
             f"{pose.gravity_deg:.1f}",
-            stood,
+            styled(stood),
         )
     console.print(table, soft_wrap=True)
     if any(pose.complaints for _, pose in found):
-        err.print(
-            "[yellow]note[/] these sensors were left out: choose a stretch of tpose_s in which the "
-            "subject stands still; gravity off for all of them is a wrong imu_up",
-            soft_wrap=True,
+        note(
+            "these sensors were left out: choose a stretch of tpose_s in which the "
+            "subject stands still; gravity off for all of them is a wrong imu_up"
         )
     console.print(
         "  R_ib is as exact as the subject's T-pose; check it on motion with --from motion",
@@ -289,8 +274,8 @@ def _write(imus: list[CalibratedImu], out: Path, origin: str) -> list[Path]:
 
 
 def _print_files(files: list[Path], imus: list[Any], out: Path) -> None:
-    print_files(files)
+    wrote(*files)
     if imus:
-        console.print(f'use it: imu_calibration = "{out.name}" under \\[session]', soft_wrap=True)
+        console.print(f'use it: imu_calibration = "{out.name}" under [session]', soft_wrap=True)
     else:
-        err.print("[red]nothing was written[/]: no sensor could be calibrated", soft_wrap=True)
+        remark(("nothing was written", "red"), "no sensor could be calibrated")

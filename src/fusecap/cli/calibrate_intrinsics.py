@@ -9,11 +9,11 @@ import typer
 
 from fusecap.cli.calibrations import (
     named_sources,
-    print_files,
     print_verdict,
     write_report,
 )
-from fusecap.cli.common import Json, check_choice, console, err, print_json, progress
+from fusecap.cli.common import Json, check_choice, print_json
+from fusecap.cli.terminal import console, err, progress, table_of, wrote
 
 if TYPE_CHECKING:
     from fusecap.calibrate.cameras.intrinsics import Intrinsics
@@ -98,7 +98,7 @@ def intrinsics(
         print_json(report | {"files": [str(file) for file in files]})
         return
     _print(lenses)
-    print_files(files)
+    wrote(*files)
 
 
 def lens_report(lens: Intrinsics) -> dict[str, Any]:
@@ -119,9 +119,8 @@ def lens_report(lens: Intrinsics) -> dict[str, Any]:
 
 
 def _print(lenses: list[Intrinsics]) -> None:
-    from rich.table import Table
 
-    table = Table("camera", "fx fy", "+-", "cx cy", "model", "rms px", "used", "covered")
+    table = table_of("camera", "fx fy", "+-", "cx cy", "model", "rms px", "used", "covered")
     console.print("pixels; +- of fx over resampled images; rms on held-out images")
     for column in table.columns:
         column.no_wrap = True
@@ -145,7 +144,6 @@ def _print(lenses: list[Intrinsics]) -> None:
             err.print(
                 f"camera '{lens.camera.name}': left out, they contradict the rest: "
                 f"{', '.join(left_out)}",
-                markup=False,
                 soft_wrap=True,
             )
         print_verdict(f"camera '{lens.camera.name}'", lens.verdict, lens.advice)

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fusecap.cli.calibrations import print_verdict
-from fusecap.cli.common import Json, SessionPath, console, print_json, progress
+from fusecap.cli.common import Json, SessionPath, print_json
+from fusecap.cli.terminal import console, progress, table_of
 
 if TYPE_CHECKING:
     from fusecap.calibrate.offsets import OffsetCalibration
@@ -57,15 +58,14 @@ def offsets(
         print_json(report)
         return
     _print_report(found)
-    console.print(f"wrote {out}; use it: landmark_offsets under \\[session]", soft_wrap=True)
+    console.print(f"wrote {out}; use it: landmark_offsets under [session]", soft_wrap=True)
 
 
 def _print_report(found: OffsetCalibration) -> None:
-    from rich.table import Table
 
     how = "the truth's poses" if found.with_truth else f"{len(found.step_mm)} rounds of solves"
     console.print(f"{found.person_frames} person-frames, {how}")
-    table = Table("landmark", "x, y, z on its bone mm", "moved", "spread", "samples")
+    table = table_of("landmark", "x, y, z on its bone mm", "moved", "spread", "samples")
     for column in table.columns:
         column.no_wrap = True
     for column in table.columns[1:]:

@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from fusecap.cli.common import Json, console, print_json, progress
+from fusecap.cli.common import Json, print_json
+from fusecap.cli.terminal import console, progress
 
 EXAMPLE = "Example: fusecap calibrate prior cmu_mocap --out prior.npz"
 

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fusecap.calibrate.verdict import Verdict
-from fusecap.cli.calibrations import print_files, print_verdict
-from fusecap.cli.common import Json, SessionPath, console, print_json, progress
+from fusecap.cli.calibrations import print_verdict
+from fusecap.cli.common import Json, SessionPath, print_json
+from fusecap.cli.terminal import console, progress, table_of, wrote
 
 if TYPE_CHECKING:
     from fusecap.calibrate.shape import MeasuredBody, ShapeCalibration
@@ -86,8 +87,8 @@ def shape(
         soft_wrap=True,
     )
     print_verdict("bodies", verdict, problems)
-    print_files([out, picture])
-    console.print("use it: copy height_m and bone_lengths_m into the session's \\[\\[subject]]")
+    wrote(out, picture)
+    console.print("use it: copy height_m and bone_lengths_m into the session's [[subject]]")
 
 
 def _problems(found: ShapeCalibration) -> list[str]:
@@ -120,14 +121,12 @@ def _problems(found: ShapeCalibration) -> list[str]:
 
 
 def _print_body(body: MeasuredBody) -> None:
-    from rich.table import Table
 
     how = "stated" if body.height_stated else f"+- {1e3 * body.height_sigma_m:.0f} mm"
     console.print(
         f"{body.name}: stature {body.height_m:.3f} m ({how}), {body.instants} instants",
-        markup=False,
     )
-    table = Table("bone", "length mm", "+-", "by stature mm", "left - right mm", "told by")
+    table = table_of("bone", "length mm", "+-", "by stature mm", "left - right mm", "told by")
     for column in table.columns[1:5]:
         column.justify = "right"
     for bone in body.bones:

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fusecap.cli.common import Json, SessionPath, console, err, print_json, progress
+from fusecap.cli.common import Json, SessionPath, print_json
+from fusecap.cli.terminal import console, note, progress, remark, table_of, wrote
 from fusecap.errors import InputError
 
 if TYPE_CHECKING:
@@ -79,15 +80,15 @@ def sync(
     else:
         _print_report(found)
         if out is not None:
-            console.print(f"wrote {out}", soft_wrap=True)
+            wrote(out)
             if not write:
-                console.print('use it: sync = "..." under \\[session]', soft_wrap=True)
+                console.print('use it: sync = "..." under [session]', soft_wrap=True)
         if write and not named:
             console.print(f"{opened.path.name} names it already", soft_wrap=True)
         if out is None and found.complete:
             console.print("nothing is changed yet: --write puts the clocks into the session")
         if picture is not None:
-            console.print(f"wrote {picture}", soft_wrap=True)
+            wrote(picture)
     if not found.complete:
         raise typer.Exit(1)
 
@@ -116,9 +117,8 @@ def _name(path: Path) -> bool:
 
 
 def _print_report(found: Synchronisation) -> None:
-    from rich.table import Table
 
-    table = Table("clock", "offset ms", "error ms", "drift ms/min", "verdict")
+    table = table_of("clock", "offset ms", "error ms", "drift ms/min", "verdict")
     for column in table.columns[1:4]:
         column.justify = "right"
     for row in found.rows:
@@ -143,11 +143,11 @@ def _print_report(found: Synchronisation) -> None:
             f"on '{stamp.bone}'",
             soft_wrap=True,
         )
-    for note in found.notes:
-        err.print(f"[yellow]note[/] {note}", soft_wrap=True)
+    for text in found.notes:
+        note(text)
     for row in found.rows:
         if row.said:
-            err.print(f"[yellow]{row.word}[/] {_label(row)}: {row.said}", soft_wrap=True)
+            remark((row.word, "yellow"), f"{_label(row)}: {row.said}")
 
 
 def _label(row: ClockRow) -> str:

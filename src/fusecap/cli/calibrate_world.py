@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from fusecap.calibrate.verdict import Verdict
-from fusecap.cli.calibrations import print_files, print_verdict
-from fusecap.cli.common import Json, check_choice, console, print_json
-from fusecap.cli.lengths import length_m, named
+from fusecap.cli.calibrations import print_verdict
+from fusecap.cli.common import Json, check_choice, length_m, named, print_json
+from fusecap.cli.terminal import console, wrote
 
 if TYPE_CHECKING:
     from fusecap.calibrate.cameras.board import Board, BoardView
@@ -308,7 +308,7 @@ def _report(
 def _print(report: dict[str, Any]) -> None:
     change = report["change"]
     x, y, z = change["origin_of_the_old_world_m"]
-    console.print(f"World from {report['how']}", markup=False, soft_wrap=True)
+    console.print(f"World from {report['how']}", soft_wrap=True)
     console.print(
         f"  turned             {change['turned_deg']:.2f} deg; the old origin is at "
         f"{x:.3f}, {y:.3f}, {z:.3f} m",
@@ -329,11 +329,10 @@ def _print(report: dict[str, Any]) -> None:
         console.print(
             f"  camera {name:<11} {place[1]:.3f} m above the floor, at x {place[0]:.3f}, "
             f"z {place[2]:.3f} m",
-            markup=False,
             soft_wrap=True,
         )
     print_verdict("world", report["verdict"], report["problems"])
-    print_files(report["files"])
+    wrote(*report["files"])
 
 
 def _print_residual(residual: dict[str, Any]) -> None:
@@ -343,4 +342,4 @@ def _print_residual(residual: dict[str, Any]) -> None:
         value = f"{residual['mm']:.1f} mm" + ("" if residual["used"] else ", left out")
     else:
         value = f"{residual['px']:.2f} px"
-    console.print(f"  {residual['name']:<18} {value}", markup=False, soft_wrap=True)
+    console.print(f"  {residual['name']:<18} {value}", soft_wrap=True)

@@ -2,36 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import typer
 
 from fusecap.calibrate.verdict import Verdict
-from fusecap.cli.common import console, err, json_text
+from fusecap.cli.common import json_text
+from fusecap.cli.terminal import console, err, styled
 from fusecap.files import write_whole
 
 _COLOURS = {Verdict.GOOD: "green", Verdict.USABLE: "yellow", Verdict.POOR: "red"}
 
 
-def coloured(verdict: Verdict) -> str:
-    """As rich's markup."""
-    return f"[{_COLOURS[verdict]}]{verdict}[/]"
+def coloured(verdict: Verdict) -> tuple[str, str]:
+    """A word and its style."""
+    return str(verdict), _COLOURS[verdict]
 
 
 def print_verdict(what: str, verdict: Verdict, advice: Iterable[str]) -> None:
     """The verdict on stdout, and on stderr what to do about one that is not good."""
-    console.print(what, end=": ", markup=False)
-    console.print(coloured(verdict))
+    console.print(styled(what, ": ", coloured(verdict)))
     for remedy in advice:
-        err.print(f"{what}: {remedy}", markup=False, soft_wrap=True)
-
-
-def print_files(files: Sequence[Path | str]) -> None:
-    """Names what was written."""
-    for file in files:
-        console.print(f"wrote {file}", markup=False, soft_wrap=True)
+        err.print(f"{what}: {remedy}", soft_wrap=True)
 
 
 def named_sources(sources: list[str]) -> dict[str, str]:

@@ -1,32 +1,29 @@
-"""What commands share: consoles, JSON, progress, choices, the files of a solve."""
+"""What commands share: JSON, choices, lengths, the files of a solve."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 
+from fusecap.cli.terminal import console, err, wrote
 from fusecap.errors import nearest
 from fusecap.files import plain
 
 if TYPE_CHECKING:
     from fusecap.batch.solve import Solved
-    from fusecap.progress import Progress
     from fusecap.take import Take
-
-err = Console(stderr=True, highlight=False, emoji=False)
-console = Console(highlight=False, emoji=False)
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object for machines.")]
 Unit = Annotated[str, typer.Option(help="Length unit of exports: m (Blender) or cm (engines).")]
 SessionPath = Annotated[
     Path, typer.Argument(help="session.toml, or the folder that holds it.", show_default=False)
 ]
+
+_METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
 
 
 def check_choice(option: str, value: str, known: tuple[str, ...]) -> None:
@@ -35,45 +32,23 @@ def check_choice(option: str, value: str, known: tuple[str, ...]) -> None:
         raise typer.BadParameter(f"'{value}'{nearest(value, known)}", param_hint=option)
 
 
-@contextmanager
-def progress(*, quiet: bool, rate: bool = False) -> Iterator[Progress]:
-    """A bar with ETA on stderr, one per kind of work; silent with --json.
+def length_m(option: str, text: str) -> float:
+    """Metres; a number without a unit is misuse (exit code 2)."""
+    match = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*(mm|cm|m|in)\s*", text)
+    if match is None:
+        raise typer.BadParameter(
+            f"'{text}': expected a length with its unit, such as 40mm, 4cm, 0.04m or 1.5in",
+            param_hint=option,
+        )
+    return float(match[1]) * _METRES[match[2]]
 
-    With `rate` it also shows how many are done per second.
-    """
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        ProgressColumn,
-        Task,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-    from rich.progress import Progress as Bars
 
-    class Rate(ProgressColumn):
-        def render(self, task: Task) -> str:
-            return f"{task.speed:.1f}/s" if task.speed else ""
-
-    columns = (
-        TextColumn("{task.description:<28.28}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        *((Rate(),) if rate else ()),
-        TimeElapsedColumn(),
-        TextColumn("ETA"),
-        TimeRemainingColumn(),
-    )
-    with Bars(*columns, console=err, disable=quiet, transient=True) as bars:
-        tasks: dict[str, Any] = {}
-
-        def show(what: str, done: int, total: int) -> None:
-            if what not in tasks:
-                tasks[what] = bars.add_task(what, total=total)
-            bars.update(tasks[what], completed=done, total=total)
-
-        yield show
+def named(option: str, text: str, expected: str) -> tuple[str, str]:
+    """The two sides of NAME=VALUE; misuse without either."""
+    name, equals, value = text.rpartition("=")
+    if not (name and equals and value):
+        raise typer.BadParameter(f"'{text}': expected {expected}", param_hint=option)
+    return name, value
 
 
 def write_take(
@@ -99,8 +74,7 @@ def write_take(
 def finish(solved: Solved, files: list[Path], as_json: bool) -> None:
     """Name the files; exit with 130 where the solve was interrupted."""
     if not as_json:
-        for path in files:
-            console.print(f"wrote {path}", soft_wrap=True)
+        wrote(*files)
     if solved.report.interrupted:
         err.print("interrupted: the files hold what was solved until then")
         raise typer.Exit(130)

@@ -7,16 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from fusecap.cli.common import (
-    Json,
-    check_choice,
-    console,
-    finish,
-    print_json,
-    print_speed,
-    progress,
-    write_take,
-)
+from fusecap.cli.common import Json, check_choice, finish, print_json, print_speed, write_take
+from fusecap.cli.terminal import console, progress, styled
 
 if TYPE_CHECKING:
     from fusecap.evaluate.simulator import Simulation
@@ -82,7 +74,8 @@ def demo(
     if as_json:
         print_json(result)
     else:
-        console.print("[bold]Simulated scene[/]: 2 subjects, 1 bystander, 4 cameras, 13 IMUs each")
+        what = ": 2 subjects, 1 bystander, 4 cameras, 13 IMUs each"
+        console.print(styled(("Simulated scene", "bold"), what))
         console.print(f"  position error     {_spread(score.position_error_mm)} mm")
         console.print(f"  orientation error  {_spread(score.orientation_error_deg)} deg")
         console.print(

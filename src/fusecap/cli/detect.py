@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fusecap.cli.common import Json, check_choice, console, err, print_json, progress
+from fusecap.cli.common import Json, check_choice, print_json
+from fusecap.cli.terminal import console, err, note, progress, remark, table_of, wrote
 from fusecap.errors import InputError
 
 if TYPE_CHECKING:
@@ -96,8 +97,7 @@ def detect(
         print_json(found.as_json() | {"files": [str(path) for path in files]})
     else:
         print_detection(found)
-        for path in files:
-            console.print(f"wrote {path}", soft_wrap=True)
+        wrote(*files)
     _warn(found)
     if found.interrupted:
         err.print("interrupted: what was found until then is kept; the same command goes on")
@@ -143,9 +143,9 @@ def _videos(recording: list[Path]) -> list[Path]:
 
 def print_detection(found: Detected) -> None:
     """What was found, camera by camera."""
-    from rich.table import Table
-
-    table = Table("camera", "frames", "people per frame", "frames with people", "mean confidence")
+    table = table_of(
+        "camera", "frames", "people per frame", "frames with people", "mean confidence"
+    )
     for column in table.columns[1:]:
         column.justify = "right"
     for name, camera in found.cameras.items():
@@ -169,14 +169,13 @@ def print_detection(found: Detected) -> None:
 
 
 def _warn(found: Detected) -> None:
-    for note in found.notes:
-        err.print("[yellow]note[/] ", end="")
-        err.print(note, markup=False, soft_wrap=True)
+    for text in found.notes:
+        note(text)
     for name, camera in found.cameras.items():
         if camera.frames and camera.frames_with_people < FEW_PEOPLE_SHARE:
-            err.print(
-                f"[yellow]warning[/] camera '{name}' sees people in "
+            remark(
+                ("warning", "yellow"),
+                f"camera '{name}' sees people in "
                 f"{100 * camera.frames_with_people:.1f} % of its frames; look at its video with "
                 "--overlay: turned on its side, too dark, or people too small for the network?",
-                soft_wrap=True,
             )

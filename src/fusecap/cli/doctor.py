@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from fusecap.cli.common import Json, console, print_json, progress
+from fusecap.cli.common import Json, print_json
+from fusecap.cli.terminal import console, progress, remark
 
 EXAMPLE = "Example: fusecap doctor recordings/duo"
 
@@ -40,11 +41,10 @@ def doctor(
     else:
         colours = {"error": "red", "warning": "yellow", "info": "cyan"}
         for finding in findings:
-            colour = colours[finding.severity]
-            console.print(f"[{colour}]{finding.severity}[/] ", end="")
-            console.print(f"{finding.where}: {finding.found}", markup=False, soft_wrap=True)
+            word = finding.severity, colours[finding.severity]
+            remark(word, f"{finding.where}: {finding.found}", where=console)
             if finding.remedy:
-                console.print(f"  -> {finding.remedy}", markup=False, soft_wrap=True)
+                console.print(f"  -> {finding.remedy}", soft_wrap=True)
         summary = f"{len(findings)} findings, {errors} of them errors"
         console.print(summary if findings else "nothing is wrong")
     if errors:

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fusecap.cli.common import Json, SessionPath, check_choice, console, err, print_json, progress
+from fusecap.cli.common import Json, SessionPath, check_choice, print_json
+from fusecap.cli.terminal import console, note, progress, table_of, wrote
 from fusecap.errors import InputError
 
 if TYPE_CHECKING:
@@ -174,24 +175,21 @@ def _chosen(text: str | None, known: Iterable[str], default: list[str]) -> list[
 
 
 def _notes(notes: Iterable[str], as_json: bool) -> None:
-    for note in () if as_json else notes:
-        err.print(f"[yellow]note[/] {note}", soft_wrap=True)
+    for text in () if as_json else notes:
+        note(text)
 
 
 def _report(table: Table, out: Path, name: str, as_json: bool) -> None:
-    from rich.table import Table as RichTable
-
     from fusecap.evaluate.datasets.score import write_table
 
     files = write_table(table, out, name)
     if as_json:
         print_json(table.as_json() | {"files": [str(path) for path in files]})
         return
-    shown = RichTable(*table.columns, title=table.title, title_justify="left")
+    shown = table_of(*table.columns, title=table.title, title_justify="left")
     for row in table.rows:
         shown.add_row(*(table.shown(value) for value in row))
     console.print(shown)
     if table.note:
         console.print(table.note, soft_wrap=True)
-    for path in files:
-        console.print(f"wrote {path}", soft_wrap=True)
+    wrote(*files)

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fusecap.cli.common import Json, check_choice, console, err, print_json
+from fusecap.cli.common import Json, check_choice, print_json
+from fusecap.cli.terminal import cells_bar, console, err, remark, styled, table_of, wrote
 
 if TYPE_CHECKING:
     from fusecap.evaluate.experiments.run import Evaluation
@@ -101,30 +102,26 @@ def _command(name: str) -> Callable[..., None]:
 
 
 def _print(evaluation: Evaluation, files: list[Path]) -> None:
-    from rich.table import Table as RichTable
-
     from fusecap.evaluate.experiments.run import described
     from fusecap.evaluate.twin import TWIN_VERSION
 
-    console.print(f"[bold]{evaluation.experiment.title}[/]: simulated twin v{TWIN_VERSION}")
+    title = (evaluation.experiment.title, "bold")
+    console.print(styled(title, f": simulated twin v{TWIN_VERSION}"))
     for outcome in evaluation.failures:
-        console.print(
-            f"failed  {described(outcome.cell)}: {outcome.error}", markup=False, soft_wrap=True
-        )
+        console.print(f"failed  {described(outcome.cell)}: {outcome.error}", soft_wrap=True)
     colours = {False: "red", None: "yellow", True: "green"}
     words = {False: "no ", None: "?  ", True: "yes"}
     for finding in evaluation.findings:
-        console.print(f"[{colours[finding.holds]}]{words[finding.holds]}[/] ", end="")
-        console.print(f"{finding.statement}: {finding.evidence}", markup=False, soft_wrap=True)
+        word = words[finding.holds], colours[finding.holds]
+        remark(word, f"{finding.statement}: {finding.evidence}", where=console)
     for table in evaluation.report.tables:
-        shown = RichTable(title=table.title, title_justify="left")
+        shown = table_of(title=table.title, title_justify="left")
         for column in table.columns:
             shown.add_column(column, overflow="fold")
         for row in table.rows:
             shown.add_row(*[table.shown(value) for value in row])
         console.print(shown)
-    for path in files:
-        console.print(f"wrote {path}", soft_wrap=True)
+    wrote(*files)
 
 
 class _Shown:
@@ -134,24 +131,7 @@ class _Shown:
         self._quiet = quiet
         self._started = time.monotonic()
         self._resumed = 0
-        from rich.progress import (
-            BarColumn,
-            MofNCompleteColumn,
-            Progress,
-            TextColumn,
-            TimeElapsedColumn,
-        )
-
-        self._bar = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TextColumn("ETA {task.fields[eta]}"),
-            console=err,
-            transient=True,
-            disable=quiet or not err.is_terminal,
-        )
+        self._bar = cells_bar(quiet=quiet or not err.is_terminal)
         self._task = self._bar.add_task("cells", total=None, eta="-")
 
     def __enter__(self) -> _Shown:
@@ -175,6 +155,5 @@ class _Shown:
         state = outcome.error or f"{outcome.elapsed_s:.1f} s"
         err.print(
             f"{done}/{total}  {described(outcome.cell)}: {state}, ETA {eta}",
-            markup=False,
             soft_wrap=True,
         )

@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from fusecap.cli.common import Json, Unit, check_choice, console, print_json
+from fusecap.cli.common import Json, Unit, check_choice, print_json
+from fusecap.cli.terminal import console
 from fusecap.export.formats import FORMATS
 
 EXAMPLE = "Example: fusecap export take.npz --format bvh --unit cm --out bvh"

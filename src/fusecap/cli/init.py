@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from fusecap.cli.common import Json, console, print_json
+from fusecap.cli.common import Json, print_json
+from fusecap.cli.terminal import console
 
 EXAMPLE = "Example: fusecap init recordings/duo, then: fusecap doctor recordings/duo"
 
@@ -43,5 +44,5 @@ def init(
             }
         )
         return
-    console.print(text, markup=False, soft_wrap=True)
+    console.print(text, soft_wrap=True)
     console.print(f"wrote {target}; check it: fusecap doctor {folder}", soft_wrap=True)

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fusecap.cli.common import Json, SessionPath, console, err, print_json, progress
+from fusecap.cli.common import Json, SessionPath, print_json
 from fusecap.cli.targets import TO_HELP, placed_targets, warn_if_open
+from fusecap.cli.terminal import console, err, note, progress
 from fusecap.errors import InputError
 
 if TYPE_CHECKING:
@@ -145,7 +146,7 @@ def live(
     for target in targets:
         warn_if_open(target)
     if page is not None and page.note:
-        err.print(f"[yellow]note[/] {page.note}", soft_wrap=True)
+        note(page.note)
     with _until_interrupted(run, quiet=as_json):
         with LiveLine(run, quiet=as_json):
             report = run.run(seconds)
@@ -248,11 +249,9 @@ def _announce(
     if page is not None:
         lines.append(f"  page -> {page}")
     for line in lines:
-        console.print(line, markup=False, soft_wrap=True)
+        console.print(line, soft_wrap=True)
     if missing:
-        err.print(
-            f"[yellow]note[/] no live key, and so not used: {', '.join(missing)}", soft_wrap=True
-        )
+        note(f"no live key, and so not used: {', '.join(missing)}")
 
 
 @contextmanager

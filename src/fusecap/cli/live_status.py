@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from types import TracebackType
 from typing import TYPE_CHECKING
 
-from fusecap.cli.common import console, err
+from fusecap.cli.terminal import console, err, note, one_line, styled, table_of
 
 if TYPE_CHECKING:
     from fusecap.engine.engine import LiveStep
@@ -30,9 +30,7 @@ class LiveLine:
         self._live = None
         self._run = run
         if not quiet and err.is_terminal:
-            from rich.live import Live
-
-            self._live = Live(console=err, auto_refresh=False, transient=True)
+            self._live = one_line()
 
     def __enter__(self) -> LiveLine:
         if not self._quiet:
@@ -64,17 +62,11 @@ class LiveLine:
         for incident in status.incidents:
             if incident.time_s > self._told:
                 self._told = incident.time_s
-                err.print(
-                    f"{incident.time_s:7.1f} s  {incident.what}", markup=False, soft_wrap=True
-                )
+                err.print(f"{incident.time_s:7.1f} s  {incident.what}", soft_wrap=True)
         if self._live is None:
-            err.print(status_line(status), markup=False, soft_wrap=True)
+            err.print(status_line(status), soft_wrap=True)
         else:
-            from rich.text import Text
-
-            text = Text(status_line(status))
-            text.append("\n")
-            text.append_text(Text.from_markup(_lights(status.sources)))
+            text = styled(status_line(status), "\n", *_lights(status.sources))
             self._live.update(text, refresh=True)
 
     def close(self) -> None:
@@ -109,21 +101,17 @@ def status_line(status: LiveStatus) -> str:
     return "  ".join(parts)
 
 
-def _lights(sources: Sequence[SourceStatus]) -> str:
+def _lights(sources: Sequence[SourceStatus]) -> list[str | tuple[str, str]]:
     """Cameras one by one, sensors by subject; a sign as well as a colour."""
-    from rich.markup import escape
-
     groups: dict[str, list[SourceStatus]] = {}
     for source in sources:
         name = source.name if source.kind == "camera" else source.name.partition("/")[0]
         groups.setdefault(name, []).append(source)
-    shown = []
+    shown: list[str | tuple[str, str]] = []
     for name, members in groups.items():
-        signs = "".join(
-            f"[{_COLOURS[one.light.value]}]{_SIGNS[one.light.value]}[/]" for one in members
-        )
-        shown.append(f"{escape(name)} {signs}")
-    return "  ".join(shown)
+        shown.append(f"{'  ' if shown else ''}{name} ")
+        shown += [(_SIGNS[one.light.value], _COLOURS[one.light.value]) for one in members]
+    return shown
 
 
 def _stage(latency: Sequence[StageLatency], name: str) -> StageLatency | None:
@@ -132,18 +120,16 @@ def _stage(latency: Sequence[StageLatency], name: str) -> StageLatency | None:
 
 def print_report(report: LiveReport) -> None:
     """Rates, people, latency, streams, and where files lie."""
-    from rich.table import Table
-
-    simulated = "[bold]simulated[/] " if report.simulated else ""
-    console.print(
-        f"{simulated}{report.elapsed_s:.1f} s: {report.instants} instants solved "
+    simulated = ("simulated ", "bold") if report.simulated else ""
+    text = (
+        f"{report.elapsed_s:.1f} s: {report.instants} instants solved "
         f"({report.solves_per_s:.2f}/s), {report.skipped} left out, "
         f"{100 * report.complete_share:.1f} % with samples of every camera on both sides; "
         f"{report.detections_per_s:.1f} detections/s; "
-        f"{100 * report.cpu_share:.0f} % CPU, {report.memory_peak_mb:.0f} MB",
-        soft_wrap=True,
+        f"{100 * report.cpu_share:.0f} % CPU, {report.memory_peak_mb:.0f} MB"
     )
-    people = Table("person", "tracked", "measured", "quality")
+    console.print(styled(simulated, text), soft_wrap=True)
+    people = table_of("person", "tracked", "measured", "quality")
     for name, subject in report.subjects.items():
         people.add_row(
             name,
@@ -153,7 +139,7 @@ def print_report(report: LiveReport) -> None:
         )
     if report.subjects:
         console.print(people)
-    latency = Table("latency", "p50 ms", "p95 ms", "p99 ms", "count")
+    latency = table_of("latency", "p50 ms", "p95 ms", "p99 ms", "count")
     for stage in report.latency:
         latency.add_row(
             stage.stage,
@@ -166,7 +152,7 @@ def print_report(report: LiveReport) -> None:
         column.justify = "right"
     if report.latency:
         console.print(latency)
-    streams = Table("to", "packets sent", "dropped", "refused", "failed")
+    streams = table_of("to", "packets sent", "dropped", "refused", "failed")
     for stream in report.streams:
         streams.add_row(
             stream.to,
@@ -179,28 +165,22 @@ def print_report(report: LiveReport) -> None:
         console.print(streams)
     for stream in report.streams:
         if stream.remark:
-            _note(f"{stream.to}: {stream.remark}")
+            note(f"{stream.to}: {stream.remark}")
     for source in report.sources:
         lost = source.malformed + source.oversize
         if source.restarts or lost or source.note:
-            _note(
+            note(
                 f"{source.source}: opened again {source.restarts} times, {lost} packets refused"
                 + (f"; {source.note}" if source.note else "")
             )
     for incident in report.incidents[:_INCIDENTS]:
-        console.print(f"{incident.time_s:7.1f} s  {incident.what}", markup=False, soft_wrap=True)
+        console.print(f"{incident.time_s:7.1f} s  {incident.what}", soft_wrap=True)
     if report.incident_count > _INCIDENTS:
         console.print(f"and {report.incident_count - _INCIDENTS} more incidents; --json holds more")
     for recording in report.recordings:
         console.print(
             f"wrote {recording.path} ({recording.megabytes:.1f} MB, {recording.seconds:.0f} s)",
-            markup=False,
             soft_wrap=True,
         )
         if recording.problem:
-            _note(f"{recording.path}: {recording.problem}")
-
-
-def _note(text: str) -> None:
-    err.print("[yellow]note[/] ", end="")
-    err.print(text, markup=False, soft_wrap=True)
+            note(f"{recording.path}: {recording.problem}")

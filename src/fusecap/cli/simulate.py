@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fusecap.cli.common import Json, check_choice, console, print_json, progress
+from fusecap.cli.common import Json, check_choice, print_json
+from fusecap.cli.terminal import console, progress, styled, wrote
 from fusecap.errors import InputError
 
 if TYPE_CHECKING:
@@ -101,10 +102,13 @@ def simulate(
         )
         return
     console.print(
-        f"[bold]Simulated[/]: {len(subjects)} subjects ({', '.join(subjects)}), "
-        f"{len(people) - len(subjects)} bystanders, {len(views)} cameras, {frames} instants"
+        styled(
+            ("Simulated", "bold"),
+            f": {len(subjects)} subjects ({', '.join(subjects)}), "
+            f"{len(people) - len(subjects)} bystanders, {len(views)} cameras, {frames} instants",
+        )
     )
-    console.print(f"wrote {session}", soft_wrap=True)
+    wrote(session)
     console.print(f"next: fusecap solve {out}", soft_wrap=True)
 
 

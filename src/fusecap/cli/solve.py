@@ -7,18 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from fusecap.cli.common import (
-    Json,
-    Unit,
-    check_choice,
-    console,
-    err,
-    finish,
-    print_json,
-    print_speed,
-    progress,
-    write_take,
-)
+from fusecap.cli.common import Json, Unit, check_choice, finish, print_json, print_speed, write_take
+from fusecap.cli.terminal import console, note, progress, styled, table_of
 from fusecap.errors import InputError
 from fusecap.export.formats import FORMATS
 
@@ -141,8 +131,8 @@ def _print_solved(solved: Solved, files: list[Path], more: dict[str, Any], as_js
     if as_json:
         print_json(solved.report.as_json() | more | {"files": [str(path) for path in files]})
     else:
-        for note in solved.report.notes:
-            err.print(f"[yellow]note[/] {note}", soft_wrap=True)
+        for text in solved.report.notes:
+            note(text)
         _print_report(solved)
     finish(solved, files, as_json)
 
@@ -165,14 +155,13 @@ def _formats(text: str | None) -> list[str]:
 
 
 def _print_report(solved: Solved) -> None:
-    from rich.table import Table
 
     report = solved.report
     console.print(
-        f"[bold]{report.instants}[/] instants ({report.duration_s:.2f} s), "
-        f"{report.cameras} cameras, {len(report.subjects)} subjects"
+        styled((str(report.instants), "bold"), f" instants ({report.duration_s:.2f} s), ")
+        + styled(f"{report.cameras} cameras, {len(report.subjects)} subjects")
     )
-    people = Table("subject", "tracked", "quality", "height m")
+    people = table_of("subject", "tracked", "quality", "height m")
     for name, values in report.subjects.items():
         people.add_row(
             name,
@@ -182,7 +171,7 @@ def _print_report(solved: Solved) -> None:
         )
     console.print(people)
     if report.reprojection_px:
-        cameras = Table("camera", "reprojection median px", "p90 px", "keypoints")
+        cameras = table_of("camera", "reprojection median px", "p90 px", "keypoints")
         for name, values in report.reprojection_px.items():
             cameras.add_row(
                 name,

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from fusecap.cli.common import Json, console, err, print_json
+from fusecap.cli.common import Json, print_json
 from fusecap.cli.targets import TO_HELP, placed_targets, warn_if_open
+from fusecap.cli.terminal import console, err, note, one_line, table_of
 
 if TYPE_CHECKING:
     from fusecap.streams.play_take import PlaybackState, TakePlayer
@@ -86,12 +87,11 @@ def _announce(player: TakePlayer, streams: Sequence[Stream], *, simulated: bool)
     console.print(
         f"{what} of {', '.join(player.cast)} at {player.rate_hz:g} frames/s, {length}; "
         "Ctrl-C ends it",
-        markup=False,
         soft_wrap=True,
     )
     for stream in streams:
         for name, address in stream.where().items() or (("everyone", str(stream.target)),):
-            console.print(f"  {name} -> {address}", markup=False, soft_wrap=True)
+            console.print(f"  {name} -> {address}", soft_wrap=True)
 
 
 @contextmanager
@@ -103,13 +103,10 @@ def _status(
         yield None
         return
     if not err.is_terminal:
-        yield lambda state: err.print(_line(state, streams), markup=False, soft_wrap=True)
+        yield lambda state: err.print(_line(state, streams), soft_wrap=True)
         return
-    from rich.live import Live
-    from rich.text import Text
-
-    with Live(console=err, auto_refresh=False, transient=True) as live:
-        yield lambda state: live.update(Text(_line(state, streams)), refresh=True)
+    with one_line() as live:
+        yield lambda state: live.update(_line(state, streams), refresh=True)
 
 
 def _line(state: PlaybackState, streams: Sequence[Stream]) -> str:
@@ -160,7 +157,6 @@ def _print_end(
     remarks: Sequence[str],
     notes: Sequence[str],
 ) -> None:
-    from rich.table import Table
 
     console.print(
         f"{state.frames} frames in {state.elapsed_s:.1f} s, {state.rate_hz:.2f} frames/s, "
@@ -168,7 +164,7 @@ def _print_end(
         f"(median), {state.late_ms_p99:.1f} ms (p99)",
         soft_wrap=True,
     )
-    table = Table("to", "packets sent", "MB", "dropped", "refused", "failed")
+    table = table_of("to", "packets sent", "MB", "dropped", "refused", "failed")
     for column in table.columns[1:]:
         column.justify = "right"
     for stream in streams:
@@ -184,6 +180,6 @@ def _print_end(
     console.print(table)
     for stream, remark in zip(streams, remarks, strict=True):
         if remark:
-            err.print(f"[yellow]note[/] {stream.target}: {remark}", soft_wrap=True)
-    for note in notes:
-        err.print(f"[yellow]note[/] {note}", soft_wrap=True)
+            note(f"{stream.target}: {remark}")
+    for text in notes:
+        note(text)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from fusecap.cli.common import err
+from fusecap.cli.terminal import note
 from fusecap.errors import InputError
 from fusecap.streams.protocols import NAMES
 
@@ -54,8 +54,7 @@ def warn_if_open(target: Target) -> None:
     from fusecap.streams.target import is_loopback, serves
 
     if serves(target) and not is_loopback(target.host):
-        err.print(
-            f"[yellow]note[/] {target} is open: whoever reaches this machine on port "
-            f"{target.port} can follow the motion; there is no password and no encryption",
-            soft_wrap=True,
+        note(
+            f"{target} is open: whoever reaches this machine on port "
+            f"{target.port} can follow the motion; there is no password and no encryption"
         )

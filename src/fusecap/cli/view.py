@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fusecap.cli.common import Json, console, err, print_json
+from fusecap.cli.common import Json, print_json
+from fusecap.cli.terminal import console, note
 
 if TYPE_CHECKING:
     from fusecap.geometry.camera import Rig
@@ -129,8 +130,8 @@ def _recorded(path: Path) -> tuple[Take, RecordedDetections | None]:
 
     recording = Recording(path)
     take = recorded_take(recording)
-    for note in loss_notes(recording):
-        err.print(f"[yellow]note[/] {note}", soft_wrap=True)
+    for text in loss_notes(recording):
+        note(text)
     setup = recorded_setup(recording)
     return take, RecordedDetections(recording, setup) if len(setup.rig) else None
 
@@ -141,13 +142,13 @@ def _announce(page: Page, *, as_json: bool, browser: bool) -> None:
 
     from fusecap.viewer.page import note_if_open
 
-    note = note_if_open(page)
+    remark = note_if_open(page)
     if as_json:
         print_json({"address": page.address, "open": page.is_open})
     else:
         who = "" if page.is_open else " (only from this machine)"
         console.print(f"watch at {page.address}{who}; Ctrl-C ends it", soft_wrap=True)
-    if note:
-        err.print(f"[yellow]note[/] {note}", soft_wrap=True)
+    if remark:
+        note(remark)
     if browser:
         webbrowser.open(page.address)
