@@ -33,8 +33,8 @@ from fusecap.evaluate.keypoint_noise import (
     occluded,
     together,
 )
-from fusecap.sources.session import load_session
 from fusecap.sources.session_data import SessionData, open_session
+from fusecap.sources.session_file import load_session
 
 _GATE = 0.25
 """A detection this share of a person's height away, in the median, is not of that person."""

@@ -43,8 +43,8 @@ from fusecap.evaluate.twin import (
     twin_training_sequences,
 )
 from fusecap.setup import setup_of
-from fusecap.sources.session import load_session
 from fusecap.sources.session_data import open_session
+from fusecap.sources.session_file import load_session
 from fusecap.take import Take
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))

@@ -53,7 +53,7 @@ from fusecap.live.recorder import Recorder
 from fusecap.live.report import LiveReport
 from fusecap.live.run import LiveOptions, LiveRun
 from fusecap.setup import session_setup
-from fusecap.sources.session import load_session
+from fusecap.sources.session_file import load_session
 
 Prepare = Callable[[Path, argparse.Namespace], LiveRun]
 

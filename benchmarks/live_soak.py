@@ -47,7 +47,7 @@ from fusecap.live.report import LiveReport
 from fusecap.live.run import LiveOptions, LiveRun
 from fusecap.live.status import LiveStatus
 from fusecap.setup import session_setup
-from fusecap.sources.session import load_session
+from fusecap.sources.session_file import load_session
 from fusecap.take import Take, load_take
 from fusecap.types import CameraImage, Event
 

@@ -17,8 +17,8 @@ from pathlib import Path
 
 from fusecap.batch.solve import solve_session
 from fusecap.evaluate.datasets.shelf import ShelfScore, load_truth, score_people
-from fusecap.sources.session import load_session
 from fusecap.sources.session_data import open_session
+from fusecap.sources.session_file import load_session
 from fusecap.take import Take, save_take
 
 CAMERAS = ("0", "1", "2", "3", "4")

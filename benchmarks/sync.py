@@ -59,7 +59,7 @@ from fusecap.evaluate.twin import (
     twin_training_sequences,
 )
 from fusecap.sources.keypoint_files import KeypointTrack
-from fusecap.sources.session import parse_session
+from fusecap.sources.session_file import parse_session
 from fusecap.take import Take
 
 RATES_HZ = (60.0, 30.0, 50.0, 60.0)

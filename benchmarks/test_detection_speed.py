@@ -33,7 +33,7 @@ from fusecap.detect.runtimes.choice import open_network
 from fusecap.geometry.camera import Rig
 from fusecap.sources.calibration_files import load_rig
 from fusecap.sources.calibration_files.writer import write_rig
-from fusecap.sources.session import load_session
+from fusecap.sources.session_file import load_session
 
 SHARED = Path(__file__).resolve().parents[1].parent / "shared"
 DATA = Path(os.environ.get("FUSECAP_DATA", SHARED / "data"))

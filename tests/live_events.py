@@ -8,7 +8,8 @@ import numpy as np
 
 from fusecap.engine.engine import Engine, LiveStep
 from fusecap.setup import SessionSetup
-from fusecap.sources.session_data import SessionData, open_imus
+from fusecap.sources.session_data import SessionData
+from fusecap.sources.session_sensors import open_imus
 from fusecap.types import CameraSample, Event, ImuSample, Tick
 
 Sample = CameraSample | ImuSample

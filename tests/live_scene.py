@@ -28,7 +28,7 @@ from fusecap.evaluate.simulator import (
     simulate,
 )
 from fusecap.setup import SessionSetup
-from fusecap.sources.session import parse_session
+from fusecap.sources.session_file import parse_session
 from fusecap.types import CameraSample, ImuSample, Tick
 from live_events import Sample
 

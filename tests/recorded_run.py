@@ -14,8 +14,8 @@ from fusecap.evaluate.simulated_session import write_session
 from fusecap.recording.setup_json import setup_values
 from fusecap.recording.writer import RecordingWriter
 from fusecap.setup import SessionSetup
-from fusecap.sources.session import load_session
 from fusecap.sources.session_data import open_session
+from fusecap.sources.session_file import load_session
 from fusecap.types import Command, CommandKind, Event
 from live_events import merged, samples_of, setup_for, ticks_of
 

@@ -16,8 +16,8 @@ from fusecap.evaluate.demo_scene import demo_scene
 from fusecap.evaluate.score import score_take
 from fusecap.evaluate.simulated_session import write_session
 from fusecap.evaluate.simulated_solve import solve_simulation
-from fusecap.sources.session import load_session
 from fusecap.sources.session_data import open_session
+from fusecap.sources.session_file import load_session
 from fusecap.take import load_take
 
 SECONDS = 1.0

@@ -24,8 +24,9 @@ from fusecap.export.overlay import PeopleNumbers
 from fusecap.setup import setup_of
 from fusecap.sources.detection_files import read_record
 from fusecap.sources.keypoint_files import read_keypoints
-from fusecap.sources.session import load_session
-from fusecap.sources.session_data import content_hash, open_session, with_detections
+from fusecap.sources.session_cameras import with_detections
+from fusecap.sources.session_data import content_hash, open_session
+from fusecap.sources.session_file import load_session
 from fusecap.sources.video import Video, probe
 from session_files import calibration_toml, edit, ring, walking_landmarks
 from tiny_networks import constant_network

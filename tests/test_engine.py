@@ -15,8 +15,8 @@ from fusecap.evaluate import simulated_session
 from fusecap.evaluate.demo_scene import demo_scene
 from fusecap.pipeline import Pipeline
 from fusecap.setup import setup_of
-from fusecap.sources.session import load_session
 from fusecap.sources.session_data import open_session
+from fusecap.sources.session_file import load_session
 from fusecap.types import CameraSample, Command, CommandKind, ImuSample, Tick
 from live_events import merged, same_bits, setup_for, steps_of
 from live_events import samples_of as session_samples

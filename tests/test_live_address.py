@@ -15,7 +15,7 @@ from fusecap.sources.live_address import (
     parse_imu_address,
 )
 from fusecap.sources.live_sensor import SensorAddress
-from fusecap.sources.session import parse_session
+from fusecap.sources.session_file import parse_session
 
 HD = Capture(size_px=(1280, 720), rate_hz=30.0, format="mjpeg")
 

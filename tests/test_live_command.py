@@ -122,7 +122,7 @@ def test_command_refuses_with_a_reason(session, monkeypatch, capsys, arguments, 
 def test_a_camera_with_other_keypoints_than_the_detector_is_refused(tmp_path, monkeypatch):
     from fusecap.errors import SessionError
     from fusecap.live import opening
-    from fusecap.sources.session import load_session
+    from fusecap.sources.session_file import load_session
     from live_fakes import FakeDetector
 
     file = write_session(tmp_path, frames=2)
@@ -138,7 +138,7 @@ def test_a_camera_with_other_keypoints_than_the_detector_is_refused(tmp_path, mo
 
 def test_what_has_no_live_key_is_listed(tmp_path):
     from fusecap.live.opening import check_live
-    from fusecap.sources.session import load_session
+    from fusecap.sources.session_file import load_session
 
     file = write_session(tmp_path, frames=2)
     edit(file, 'name = "cam1"', 'name = "cam1"\nlive = "openpose:keypoints/cam1"')

@@ -31,7 +31,7 @@ from fusecap.live.devices.source import SessionClock, SourceLost
 from fusecap.sources.imu_streams.mvn import mvn_packet, mvn_sensor_name
 from fusecap.sources.imu_streams.osc import osc_packet
 from fusecap.sources.live_address import Capture, GenICam, V4l2, VideoUrl, Webcam
-from fusecap.sources.session import load_session
+from fusecap.sources.session_file import load_session
 from fusecap.types import CameraImage, CameraSample, ImuSample
 from imu_packets import mvn_segments, mvn_trackers, osc_bundle, osc_message
 from session_files import edit, write_session

@@ -14,8 +14,8 @@ from fusecap.body.landmarks import LANDMARK_SETS
 from fusecap.errors import InputError, SessionError
 from fusecap.live.devices.playback_sources import PlaybackOptions, Stall, playback_sources
 from fusecap.live.devices.source import Delivery, SessionClock, Source, SourceCounts, SourceLost
-from fusecap.sources.session import load_session
 from fusecap.sources.session_data import open_session
+from fusecap.sources.session_file import load_session
 from fusecap.types import CameraImage, CameraSample, ImuSample
 from session_files import calibration_toml, edit, imu_csv, ring, write_session
 from video_files import number_of, write_video

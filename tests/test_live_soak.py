@@ -21,7 +21,7 @@ from fusecap.engine.engine import Engine, LiveStep
 from fusecap.live.devices.playback_sources import PlaybackOptions, playback_sources
 from fusecap.live.devices.source import SessionClock, Source, SourceLost
 from fusecap.setup import session_setup
-from fusecap.sources.session import load_session
+from fusecap.sources.session_file import load_session
 from fusecap.take import load_take
 from fusecap.types import Event, Tick
 

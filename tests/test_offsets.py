@@ -28,8 +28,8 @@ from fusecap.evaluate.simulator import Person, camera_ring, placed, simulate
 from fusecap.geometry.camera import Rig
 from fusecap.solve.body_measure import BodyMeasure
 from fusecap.sources.offset_files import offsets_toml, read_offsets
-from fusecap.sources.session import load_session
 from fusecap.sources.session_data import open_session
+from fusecap.sources.session_file import load_session
 from motions import person, walk
 
 BODY25 = landmark_set_named("body25")

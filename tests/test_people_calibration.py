@@ -28,8 +28,8 @@ from fusecap.errors import InputError
 from fusecap.evaluate.rig_noise import RigNoise, believed
 from fusecap.geometry.camera import Rig
 from fusecap.sources.calibration_files import load_rig
-from fusecap.sources.session import load_session
 from fusecap.sources.session_data import open_session
+from fusecap.sources.session_file import load_session
 from scenes import ring
 from session_files import calibration_toml, edit, write_session
 from test_real_recordings import script

@@ -11,8 +11,8 @@ from fusecap.evaluate.demo_scene import demo_scene
 from fusecap.evaluate.simulated_session import write_session
 from fusecap.pipeline import Pipeline
 from fusecap.setup import setup_of
-from fusecap.sources.session import load_session
 from fusecap.sources.session_data import open_session
+from fusecap.sources.session_file import load_session
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,8 @@ import pytest
 from fusecap.batch.solve import solve_session
 from fusecap.doctor import diagnose
 from fusecap.evaluate.datasets.shelf import load_truth, score_people
-from fusecap.sources.session import load_session
 from fusecap.sources.session_data import open_session
+from fusecap.sources.session_file import load_session
 
 pytestmark = [pytest.mark.real_data, pytest.mark.slow]
 

@@ -21,8 +21,9 @@ from fusecap.errors import InputError
 from fusecap.geometry.camera import Rig
 from fusecap.recording.reader import Recording
 from fusecap.setup import SessionSetup
-from fusecap.sources.session import Session, load_session
+from fusecap.sources.session import Session
 from fusecap.sources.session_data import open_session
+from fusecap.sources.session_file import load_session
 from fusecap.take import load_take
 from fusecap.types import Command, CommandKind, ImuSample, Tick
 from live_events import same_bits

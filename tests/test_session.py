@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 
 from fusecap.errors import InputError, SessionError
-from fusecap.sources.session import load_session, parse_session
-from fusecap.sources.session_data import open_keypoints, open_session
+from fusecap.sources.session_cameras import open_keypoints
+from fusecap.sources.session_data import open_session
+from fusecap.sources.session_file import load_session, parse_session
 from session_files import edit, imu_csv, write_session
 
 CAMERA = '[session]\nname = "a"\ncalibration = "c.toml"\n[[camera]]\nname = "left"\nkeypoints="k"\n'

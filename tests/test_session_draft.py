@@ -11,8 +11,8 @@ from fusecap.cli import app
 from fusecap.errors import InputError, SessionError
 from fusecap.sources.folder_survey import survey
 from fusecap.sources.sensor_bones import bone_of
-from fusecap.sources.session import load_session
 from fusecap.sources.session_draft import draft
+from fusecap.sources.session_file import load_session
 
 
 @pytest.mark.parametrize(

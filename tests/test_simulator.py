@@ -27,8 +27,8 @@ from fusecap.evaluate.simulator import (
     placed,
     simulate,
 )
-from fusecap.sources.session import load_session
 from fusecap.sources.session_data import open_session
+from fusecap.sources.session_file import load_session
 from fusecap.take import load_take
 from motions import person, walk
 

@@ -23,8 +23,9 @@ from fusecap.evaluate.demo_scene import demo_scene
 from fusecap.evaluate.simulated_session import write_session
 from fusecap.sources.imu_files import ImuTrack
 from fusecap.sources.keypoint_files import KeypointTrack
-from fusecap.sources.session import SubjectSettings, load_session, parse_session
+from fusecap.sources.session import SubjectSettings
 from fusecap.sources.session_data import open_session
+from fusecap.sources.session_file import load_session, parse_session
 from fusecap.sources.sync_files import Clock, Clocks, read_sync, sync_toml
 from session_files import edit, ring, walking_landmarks
 from session_files import write_session as write_small

@@ -10,8 +10,10 @@ from fusecap.body.landmarks import landmark_set_named
 from fusecap.geometry.camera import Y_UP_FROM_Z_UP
 from fusecap.sources.imu_files import ImuTrack, SharedClock
 from fusecap.sources.keypoint_files import KeypointTrack, without_missing
-from fusecap.sources.session import SubjectSettings, load_session
-from fusecap.sources.session_data import open_imus, open_session
+from fusecap.sources.session import SubjectSettings
+from fusecap.sources.session_data import open_session
+from fusecap.sources.session_file import load_session
+from fusecap.sources.session_sensors import open_imus
 from fusecap.sources.synchronizer import (
     GRAVITY_M_S2,
     MountedImu,
@@ -217,7 +219,7 @@ def test_sensors_of_one_recorder_keep_their_delays(tmp_path, monkeypatch):
             clock=SharedClock(start_s=starts[path.name], period_s=655.36),
         )
 
-    monkeypatch.setattr("fusecap.sources.session_data.read_imu", read)
+    monkeypatch.setattr("fusecap.sources.session_sensors.read_imu", read)
     subject = SubjectSettings.model_validate(
         {"name": "A", "imu": [{"bone": "hips", "file": name} for name in starts]}
     )

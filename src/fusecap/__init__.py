@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from fusecap.solve.options import Weights as Weights
     from fusecap.solve.pose_solver import ImuSites as ImuSites
     from fusecap.sources.session import Session as Session
-    from fusecap.sources.session import load_session as load_session
     from fusecap.sources.session_data import open_session as open_session
+    from fusecap.sources.session_file import load_session as load_session
     from fusecap.take import Take as Take
     from fusecap.take import load_take as load_take
     from fusecap.take import save_take as save_take

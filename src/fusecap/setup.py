@@ -23,7 +23,7 @@ from fusecap.solve.options import SolverOptions, Weights
 from fusecap.solve.pose_solver import ImuSites
 from fusecap.sources.offset_files import read_offsets
 from fusecap.sources.session import Session, SubjectSettings
-from fusecap.sources.session_data import common_landmarks, open_rig
+from fusecap.sources.session_cameras import common_landmarks, open_rig
 
 
 @dataclass(frozen=True, kw_only=True)

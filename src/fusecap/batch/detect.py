@@ -41,7 +41,7 @@ from fusecap.sources.detection_files import DetectionRecord, mark, read_record
 from fusecap.sources.frame_sets import FramePlan, clock_times_ns, every_frame, frame_sets
 from fusecap.sources.keypoint_files import read_keypoints, read_people
 from fusecap.sources.session import Session
-from fusecap.sources.session_data import open_rig
+from fusecap.sources.session_cameras import open_rig
 from fusecap.sources.video import Video
 from fusecap.types import Detections
 

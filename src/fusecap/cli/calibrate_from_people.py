@@ -35,8 +35,8 @@ def from_people(
     from fusecap.calibrate.cameras.people import refine_from_people
     from fusecap.calibrate.pictures import plot_people
     from fusecap.sources.calibration_files.writer import check_rig_path, write_rig
-    from fusecap.sources.session import load_session
     from fusecap.sources.session_data import open_session
+    from fusecap.sources.session_file import load_session
 
     check_rig_path(out)
     with progress(quiet=as_json) as show:

@@ -47,7 +47,7 @@ def imu(
     """
     from fusecap.calibrate.imus import session as calibration
     from fusecap.files import check_writable
-    from fusecap.sources.session import load_session
+    from fusecap.sources.session_file import load_session
     from fusecap.take import load_take
 
     check_choice("--from", source, ("motion", "tpose"))

@@ -38,8 +38,8 @@ def offsets(
     from fusecap.calibrate.offsets import calibrate_session, origin
     from fusecap.files import check_writable, write_whole
     from fusecap.sources.offset_files import offsets_toml
-    from fusecap.sources.session import load_session
     from fusecap.sources.session_data import open_session
+    from fusecap.sources.session_file import load_session
     from fusecap.take import load_take
 
     check_writable(out)

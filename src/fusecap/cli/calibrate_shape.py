@@ -41,8 +41,8 @@ def shape(
     from fusecap.calibrate.shape import calibrate_shape, shape_toml
     from fusecap.files import check_writable, write_whole
     from fusecap.setup import setup_of
-    from fusecap.sources.session import load_session
     from fusecap.sources.session_data import open_session
+    from fusecap.sources.session_file import load_session
 
     check_writable(out)
     with progress(quiet=as_json) as show:

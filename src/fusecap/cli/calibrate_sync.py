@@ -43,7 +43,7 @@ def sync(
 
     from fusecap.calibrate.sync.session import synchronise
     from fusecap.files import check_writable, write_whole
-    from fusecap.sources.session import missing_files, parse_session
+    from fusecap.sources.session_file import missing_files, parse_session
     from fusecap.sources.sync_files import sync_toml
 
     if out is not None and write:

@@ -63,7 +63,7 @@ def detect(
     )
     from fusecap.detect.build import build_detector
     from fusecap.detect.runtimes.choice import RUNTIMES
-    from fusecap.sources.session import load_session
+    from fusecap.sources.session_file import load_session
 
     if runtime is not None:
         check_choice("--runtime", runtime, RUNTIMES)

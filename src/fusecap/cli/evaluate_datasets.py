@@ -51,8 +51,8 @@ def session(
     """Solve a session and score it against its truth, as `fusecap simulate` writes it."""
     from fusecap.batch.solve import solve_session
     from fusecap.evaluate.datasets.session import session_table
-    from fusecap.sources.session import load_session
     from fusecap.sources.session_data import open_session
+    from fusecap.sources.session_file import load_session
     from fusecap.take import load_take
 
     loaded = load_session(session)

@@ -110,7 +110,7 @@ def live(
     from fusecap.live.recorder import RecordSwitch
     from fusecap.live.run import LiveOptions, LiveRun
     from fusecap.recording.layout import SUFFIX
-    from fusecap.sources.session import load_session
+    from fusecap.sources.session_file import load_session
 
     if no_record and (record is not None or record_images):
         raise InputError("--no-record says that nothing is recorded; leave it or --record out")

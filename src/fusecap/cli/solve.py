@@ -59,8 +59,8 @@ def solve(
     from fusecap.cli.detect import detect_missing, print_detection
     from fusecap.files import safe_name
     from fusecap.recording.layout import SUFFIX
-    from fusecap.sources.session import load_session
     from fusecap.sources.session_data import open_session
+    from fusecap.sources.session_file import load_session
 
     formats = _formats(export)
     check_choice("--unit", unit, ("m", "cm"))

@@ -58,8 +58,8 @@ def view(
     Nothing leaves this machine. Ctrl-C ends it.
     """
     from fusecap.recording.layout import SUFFIX
-    from fusecap.sources.session import parse_session
-    from fusecap.sources.session_data import open_rig
+    from fusecap.sources.session_cameras import open_rig
+    from fusecap.sources.session_file import parse_session
     from fusecap.take import load_take
 
     detections = None

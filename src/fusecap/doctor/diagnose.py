@@ -17,20 +17,14 @@ from fusecap.findings import Finding, Findings, Severity
 from fusecap.geometry.camera import Rig
 from fusecap.progress import Progress
 from fusecap.sources.keypoint_files import KeypointTrack
-from fusecap.sources.session import (
-    FILE_NAME,
-    Session,
+from fusecap.sources.session import FILE_NAME, Session
+from fusecap.sources.session_cameras import open_rig, with_detections
+from fusecap.sources.session_data import session_clocks, solve_times_s, unplaced_wearers
+from fusecap.sources.session_file import (
     missing_files,
     parse_session,
     session_file,
     with_imu_calibration,
-)
-from fusecap.sources.session_data import (
-    open_rig,
-    session_clocks,
-    solve_times_s,
-    unplaced_wearers,
-    with_detections,
 )
 from fusecap.sources.sync_files import Clocks
 

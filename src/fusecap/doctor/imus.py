@@ -12,7 +12,7 @@ from fusecap.geometry.quaternions import from_wxyz
 from fusecap.sources.imu_files import read_imu
 from fusecap.sources.imu_files.track import GRAVITY_M_S2, ImuTrack
 from fusecap.sources.session import ImuSettings, Session
-from fusecap.sources.session_data import mount, sensor_notes
+from fusecap.sources.session_sensors import mount, sensor_notes
 from fusecap.sources.sync_files import Clocks
 
 

@@ -11,7 +11,7 @@ from fusecap.geometry.camera import Camera, Rig
 from fusecap.progress import Progress
 from fusecap.sources.keypoint_files import KeypointTrack, read_keypoints
 from fusecap.sources.session import Session
-from fusecap.sources.session_data import broken_files, common_landmarks
+from fusecap.sources.session_cameras import broken_files, common_landmarks
 
 LOW_COVERAGE = 0.1
 

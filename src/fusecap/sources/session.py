@@ -1,14 +1,14 @@
 """`session.toml`: what was recorded, where its files lie, and how to solve it.
 
-Every key is described in docs/formats.md. Loading checks keys, types, units and names, and that
-the named files exist; it opens none of them (`fusecap.sources.session_data` does).
+Every key is described in docs/formats.md; here are the tables with the types, units and names that
+they allow. `fusecap.sources.session_file` reads the file, `fusecap.sources.session_data` opens what
+it names.
 """
 
 from __future__ import annotations
 
 import re
-import tomllib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,7 +18,6 @@ from pydantic import (
     ConfigDict,
     Field,
     PrivateAttr,
-    ValidationError,
     ValidationInfo,
     field_validator,
     model_validator,
@@ -28,8 +27,7 @@ from pydantic_core import PydanticCustomError
 from fusecap.body.landmarks import LANDMARK_SETS
 from fusecap.body.shape import MAX_HEIGHT_M, MIN_HEIGHT_M
 from fusecap.body.skeleton import Skeleton, skeleton_named
-from fusecap.errors import InputError, MotionError, SessionError, nearest
-from fusecap.sources.imu_calibration_files import read_imu_calibration
+from fusecap.errors import InputError, MotionError, nearest
 from fusecap.sources.imu_files import formats as imu_formats
 from fusecap.sources.live_address import parse_camera_address, parse_imu_address
 
@@ -401,153 +399,3 @@ def _unknown_bones(skeleton: Skeleton, subject: SubjectSettings) -> list[str]:
         except MotionError as error:
             problems.append(f"[[subject]] '{subject.name}': {error}")
     return problems
-
-
-def load_session(path: Path | str) -> Session:
-    """Reads a session file, or the `session.toml` of a folder; raises `SessionError`.
-
-    The error lists everything that is wrong, one line each, missing files included.
-    """
-    session = parse_session(path)
-    missing = missing_files(session)
-    if missing:
-        raise SessionError("\n".join(f"{session.path}: {line}" for line in missing))
-    return with_imu_calibration(session)
-
-
-def with_imu_calibration(session: Session) -> Session:
-    """The session with the sensors' constants of its `imu_calibration`; raises `SessionError`."""
-    path = session.settings.imu_calibration
-    if path is None:
-        return session
-    found = {(imu.subject, imu.bone): imu for imu in read_imu_calibration(path)}
-    known = {(subject.name, imu.bone) for subject in session.subjects for imu in subject.imus}
-    for subject, bone in found.keys() - known:
-        raise SessionError(
-            f"{path}: holds imu '{bone}' of '{subject}', which {session.path} does not have; "
-            "calibrate this session with: fusecap calibrate imu"
-        )
-    subjects = []
-    for subject in session.subjects:
-        imus = []
-        for imu in subject.imus:
-            own = found.get((subject.name, imu.bone))
-            update = (
-                {}
-                if own is None
-                else {
-                    "bone_from_imu_wxyz": own.bone_from_imu_wxyz,
-                    "heading_deg": own.heading_deg,
-                }
-            )
-            imus.append(imu.model_copy(update=update))
-        subjects.append(subject.model_copy(update={"imus": tuple(imus)}))
-    return session.model_copy(update={"subjects": tuple(subjects)})
-
-
-def parse_session(path: Path | str) -> Session:
-    """`load_session` without looking whether the files it names exist."""
-    file = session_file(path)
-    try:
-        data = tomllib.loads(file.read_text(encoding="utf-8"))
-    except tomllib.TOMLDecodeError as error:
-        raise SessionError(f"{file}: not valid TOML: {error}") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise SessionError(f"{file}: cannot be read as UTF-8 text: {error}") from None
-    try:
-        return Session.model_validate(data, context={"file": file})
-    except ValidationError as error:
-        raise SessionError(_readable(error, file, data)) from None
-
-
-def session_file(path: Path | str) -> Path:
-    """The session file that `path` (a file or its folder) means; raises `SessionError`."""
-    path = Path(path)
-    file = path / FILE_NAME if path.is_dir() else path
-    if not file.is_file():
-        raise SessionError(
-            f"{file}: no such file; expected a session file or a folder with a {FILE_NAME}"
-        )
-    return file
-
-
-def missing_files(session: Session) -> list[str]:
-    """One line per file or folder that the session names and that is not there."""
-    lines = []
-
-    def check(where: str, path: Path | None, *, folder: bool | None) -> None:
-        if path is None:
-            return
-        kind = {True: "folder", False: "file", None: "file or folder"}[folder]
-        if not path.exists():
-            lines.append(f"{where}: no {kind} {path}; check the path (relative to {FILE_NAME})")
-        elif folder is not None and path.is_dir() != folder:
-            lines.append(f"{where}: {path} is not a {kind}")
-
-    check("[session] calibration", session.settings.calibration, folder=None)
-    check("[session] landmark_offsets", session.settings.landmark_offsets, folder=False)
-    check("[session] imu_calibration", session.settings.imu_calibration, folder=False)
-    check("[session] sync", session.settings.sync, folder=False)
-    for camera in session.cameras:
-        check(f"[[camera]] '{camera.name}' keypoints", camera.keypoints, folder=True)
-        check(f"[[camera]] '{camera.name}' video", camera.video, folder=False)
-    for subject in session.subjects:
-        for imu in subject.imus:
-            check(f"[[subject]] '{subject.name}' imu '{imu.bone}' file", imu.file, folder=False)
-    return lines
-
-
-_EXPECTED = {
-    "missing": "missing; this key is required",
-    "float_type": "found {found}, expected a number",
-    "int_type": "found {found}, expected a whole number",
-    "bool_type": "found {found}, expected true or false",
-    "string_type": "found {found}, expected text in quotes",
-    "path_type": "found {found}, expected a path in quotes",
-    "string_too_short": "found an empty text",
-    "finite_number": "found {found}, expected a finite number",
-    "tuple_type": "found {found}, expected a list",
-    "greater_than_equal": "found {found}, expected at least {ge}",
-    "model_type": "found {found}, expected a table",
-    "dict_type": "found {found}, expected a table",
-}
-
-
-def _readable(error: ValidationError, file: Path, data: Mapping[str, Any]) -> str:
-    lines = []
-    for item in error.errors():
-        where = _where(item["loc"], data)
-        text = _EXPECTED.get(item["type"], item["msg"])
-        found = item.get("input")
-        if item["type"] == "tuple_type" and isinstance(found, dict):
-            text = f"found a single table; write [[{'.'.join(map(str, item['loc']))}]]"
-        if item["type"] == "model_type" and isinstance(found, list):
-            text = f"found a list of tables; write [{'.'.join(map(str, item['loc']))}]"
-        context = {"found": repr(found), **item.get("ctx", {})}
-        if text is _EXPECTED.get(item["type"]):
-            text = text.format_map(context)
-        lines += [f"{file}: {where}{': ' if where else ''}{line}" for line in text.splitlines()]
-    return "\n".join(lines)
-
-
-def _where(loc: tuple[int | str, ...], data: Any) -> str:
-    """`("camera", 1, "rate_hz")` as "[[camera]] 'left' rate_hz"."""
-    words, tables = [], ""
-    for part in loc:
-        below = None
-        if isinstance(data, Mapping) and isinstance(part, str):
-            below = data.get(part)
-        elif isinstance(data, list) and isinstance(part, int) and part < len(data):
-            below = data[part]
-        if isinstance(part, int):
-            label = below.get("name", below.get("bone")) if isinstance(below, Mapping) else None
-            words.append(f"'{label}'" if isinstance(label, str) else f"no. {part + 1}")
-        elif isinstance(below, list) and any(isinstance(entry, Mapping) for entry in below):
-            tables = f"{tables}.{part}" if tables else part
-            words.append(f"[[{tables}]]")
-        elif len(words) == 0:
-            words.append(f"[{part}]")
-        else:
-            words.append(part)
-        data = below
-    return " ".join(words)

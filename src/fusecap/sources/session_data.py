@@ -8,32 +8,34 @@ session's rate are not interpolated at all.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from fusecap.body.landmarks import LandmarkSet, landmark_set_named
+from fusecap.body.landmarks import LandmarkSet
 from fusecap.errors import SessionError
 from fusecap.findings import Finding
 from fusecap.geometry.camera import Rig
-from fusecap.geometry.quaternions import from_wxyz
 from fusecap.progress import Progress
-from fusecap.sources.calibration_files import check_rig, load_rig
 from fusecap.sources.detection_files import read_record
-from fusecap.sources.imu_files import ImuTrack, read_imu
-from fusecap.sources.keypoint_files import KeypointTrack, read_keypoints
-from fusecap.sources.offset_files import read_offsets
-from fusecap.sources.session import CameraSettings, ImuSettings, Session, SubjectSettings
+from fusecap.sources.imu_files import ImuTrack
+from fusecap.sources.keypoint_files import KeypointTrack
+from fusecap.sources.session import Session
+from fusecap.sources.session_cameras import (
+    broken_files,
+    common_landmarks,
+    open_keypoints,
+    open_rig,
+    with_detections,
+)
+from fusecap.sources.session_sensors import mount, open_imus, sensor_notes
 from fusecap.sources.sync_files import Clocks, read_sync
 from fusecap.sources.synchronizer import (
     MAX_GAP_S,
-    MountedImu,
     people_at,
     resample_imus,
-    world_from_imu_world,
 )
 from fusecap.types import Detections, ImuReading
 
@@ -157,33 +159,6 @@ def open_session(session: Session, progress: Progress | None = None) -> SessionD
     )
 
 
-def with_detections(session: Session) -> Session:
-    """The session with what `fusecap detect` left in its folder.
-
-    A camera that names a video only gets the folder of its keypoints, where these are complete and
-    the video still has the name and size that they were made from. A session that does not state
-    its rate takes that of the first detected video.
-    """
-    cameras = tuple(_with_folder(session, camera) for camera in session.cameras)
-    settings = session.settings
-    if "rate_hz" not in settings.model_fields_set:
-        records = [read_record(c.keypoints) for c in cameras if c.keypoints and not c.rate_hz]
-        rates_hz = [record.video.rate_hz for record in records if record is not None]
-        if rates_hz:
-            settings = settings.model_copy(update={"rate_hz": rates_hz[0]})
-    return session.model_copy(update={"cameras": cameras, "settings": settings})
-
-
-def _with_folder(session: Session, camera: CameraSettings) -> CameraSettings:
-    if camera.keypoints is not None or camera.video is None:
-        return camera
-    folder = session.detection_folder(camera)
-    record = read_record(folder)
-    if record is None or not record.complete or not record.video.is_likely(camera.video):
-        return camera
-    return camera.model_copy(update={"keypoints": folder})
-
-
 def unplaced_wearers(session: Session) -> list[Finding]:
     """People who wear sensors but could be anyone the cameras find first."""
     if not session.cameras or len(session.subjects) < 2:
@@ -204,201 +179,6 @@ def unplaced_wearers(session: Session) -> list[Finding]:
 def session_clocks(session: Session) -> Clocks:
     """Those of the session's `sync` file; of one without, everybody's times are right."""
     return Clocks() if session.settings.sync is None else read_sync(session.settings.sync)
-
-
-def open_rig(session: Session) -> tuple[Rig, list[Finding]]:
-    """The session's cameras in its order, and what is odd about them.
-
-    Raises `SessionError` for cameras without a calibration.
-    """
-    if not session.cameras:
-        return Rig(cameras=()), []
-    if session.settings.calibration is None:
-        raise SessionError(
-            f"{session.path}: [session] calibration is missing; cameras need a calibration file, "
-            "as fusecap calibrate extrinsics writes it"
-        )
-    rig = load_rig(
-        session.settings.calibration,
-        up=session.settings.up,
-        unit=session.settings.calibration_unit,
-    ).subset([camera.name for camera in session.cameras])
-    return rig, check_rig(rig, floor=session.settings.floor)
-
-
-def common_landmarks(session: Session) -> LandmarkSet | None:
-    """The one landmark set of all cameras, with the session's offsets; None without cameras.
-
-    Raises `SessionError` when cameras differ, `InputError` for offsets that cannot be used.
-    """
-    names = {camera.name: _landmark_set_name(session, camera) for camera in session.cameras}
-    if len(set(names.values())) > 1:
-        listed = ", ".join(f"'{camera}' openpose-{name}" for camera, name in names.items())
-        raise SessionError(
-            f"{session.path}: cameras with different keypoint formats ({listed}); "
-            "expected one format for all: run the same detector on every camera"
-        )
-    if not names:
-        return None
-    landmarks = landmark_set_named(next(iter(names.values())))
-    if session.settings.landmark_offsets is None:
-        return landmarks
-    return landmarks.calibrated(read_offsets(session.settings.landmark_offsets, landmarks.name))
-
-
-def _landmark_set_name(session: Session, camera: CameraSettings) -> str:
-    """The set that a detection left in the camera's folder, else that of its format."""
-    record = read_record(camera.keypoints) if camera.keypoints else None
-    if record is None:
-        return camera.landmark_set_name
-    if "format" in camera.model_fields_set and record.landmark_set != camera.landmark_set_name:
-        raise SessionError(
-            f"{session.path}: camera '{camera.name}' states format = \"{camera.format}\", but "
-            f"{camera.keypoints} holds openpose-{record.landmark_set}; leave format out"
-        )
-    return record.landmark_set
-
-
-def open_keypoints(session: Session, progress: Progress | None = None) -> tuple[KeypointTrack, ...]:
-    """Of all cameras, on their own clocks; raises `InputError`."""
-    landmarks = common_landmarks(session)
-    return tuple(
-        _keypoints(session, index, landmarks, progress) for index in range(len(session.cameras))
-    )
-
-
-def _keypoints(
-    session: Session, index: int, landmarks: LandmarkSet | None, progress: Progress | None
-) -> KeypointTrack:
-    camera = session.cameras[index]
-    if camera.keypoints is None and camera.video is None:
-        raise SessionError(
-            f"{session.path}: camera '{camera.name}' is live only, nothing is recorded here; solve "
-            "a recording of fusecap live (.mcap), or name keypoints or a video"
-        )
-    if camera.keypoints is None or landmarks is None:
-        raise SessionError(
-            f"{session.path}: camera '{camera.name}' has a video but no keypoints yet; run: "
-            f"fusecap detect {session.folder}"
-        )
-    return read_keypoints(
-        camera.keypoints,
-        name=camera.name,
-        landmarks=landmarks,
-        rate_hz=session.camera_rate_hz(camera),
-        offset_s=camera.offset_s,
-        own_times=camera.rate_hz is None,
-        progress=progress,
-    )
-
-
-def broken_files(track: KeypointTrack) -> Finding:
-    """The finding for unreadable keypoint files."""
-    share = len(track.broken) / len(track.frames)
-    return Finding(
-        severity="warning",
-        where=f"camera '{track.name}'",
-        found=f"{len(track.broken)} of {len(track.frames)} keypoint files ({share:.1%}) are "
-        f"truncated or garbled (first: {track.broken[0]})",
-        remedy="they count as frames without people; run the detector again on these frames",
-    )
-
-
-def open_imus(subject: SubjectSettings) -> list[ImuTrack]:
-    """The subject's tracks on the session's clock.
-
-    Sensors that share a recorder's clock keep their mutual delays: the earliest starts at 0.
-    """
-    tracks = []
-    for imu in subject.imus:
-        if imu.file is None:
-            raise SessionError(
-                f"imu '{imu.bone}' of '{subject.name}' is live only; name a file of its samples, "
-                "or use: fusecap live"
-            )
-        tracks.append(read_imu(imu.file, format=imu.format, sensor=imu.sensor, rate_hz=imu.rate_hz))
-    delays = _shared_delays_s(tracks)
-    return [
-        replace(track, times_s=track.times_s + delay + imu.offset_s)
-        for track, delay, imu in zip(tracks, delays, subject.imus, strict=True)
-    ]
-
-
-def _shared_delays_s(tracks: list[ImuTrack]) -> list[float]:
-    delays = [0.0] * len(tracks)
-    for period_s in {track.clock.period_s for track in tracks if track.clock}:
-        group = [i for i, t in enumerate(tracks) if t.clock and t.clock.period_s == period_s]
-        starts = np.array([t.clock.start_s for i, t in enumerate(tracks) if i in group and t.clock])
-        behind = np.mod(starts - starts[0] + period_s / 2, period_s) - period_s / 2
-        for i, delay in zip(group, behind - behind.min(), strict=True):
-            delays[i] = float(delay)
-    return delays
-
-
-def sensor_notes(subject: SubjectSettings, tracks: Sequence[ImuTrack | None]) -> list[Finding]:
-    """What was dealt with in a subject's sensor files; None for a file that was not read.
-
-    Lost samples are one finding per subject: radio drops some of nearly every sensor's.
-    """
-    findings, lost = [], []
-    for imu, track in zip(subject.imus, tracks, strict=True):
-        for note in () if track is None else track.notes:
-            if "samples lost" in note:
-                lost.append((imu.bone, note))
-            else:
-                where = f"imu '{imu.bone}' of '{subject.name}'"
-                findings.append(Finding(severity="warning", where=where, found=note, remedy=""))
-    if lost:
-        each = ", ".join(f"{bone} {note.replace(' samples lost', '')}" for bone, note in lost)
-        alone = len(lost) == 1
-        findings.append(
-            Finding(
-                severity="warning",
-                where=f"imu '{lost[0][0]}' of '{subject.name}'"
-                if alone
-                else f"sensors of '{subject.name}'",
-                found=lost[0][1] if alone else f"samples lost: {each}",
-                remedy="gaps over 0.1 s are not bridged",
-            )
-        )
-    return findings
-
-
-def mount(subject: SubjectSettings, tracks: list[ImuTrack]) -> list[MountedImu]:
-    """Sensors with their offsets; `bone_from_imu` from the T-pose where it is not given."""
-    return [
-        MountedImu(
-            bone=imu.bone,
-            track=track,
-            world_from_imu_world=world_from_imu_world(imu.imu_up, imu.heading_deg),
-            bone_from_imu=_bone_from_imu(subject, imu, track),
-            position_in_bone_m=np.array(imu.position_m),
-        )
-        for imu, track in zip(subject.imus, tracks, strict=True)
-    ]
-
-
-def _bone_from_imu(subject: SubjectSettings, imu: ImuSettings, track: ImuTrack) -> np.ndarray:
-    where = f"imu '{imu.bone}' of '{subject.name}'"
-    if imu.bone_from_imu_wxyz is not None:
-        return from_wxyz(imu.bone_from_imu_wxyz).as_matrix()
-    if subject.tpose_s is None:
-        raise SessionError(
-            f"{where}: how it sits on the bone is not known; fusecap calibrate imu finds it from "
-            "motion the cameras saw, tpose_s states when the subject stands in the T-pose, "
-            "bone_from_imu_wxyz = [1, 0, 0, 0] a sensor whose axes are the bone's"
-        )
-    start_s, end_s = subject.tpose_s
-    inside = (track.times_s >= start_s) & (track.times_s <= end_s)
-    if not inside.any():
-        raise SessionError(
-            f"{where}: no sample in tpose_s = [{start_s:g}, {end_s:g}]; its samples run from "
-            f"{track.times_s[0]:g} to {track.times_s[-1]:g} s"
-        )
-    mean = from_wxyz(track.orientation_wxyz[inside]).mean().as_matrix()
-    world_from_imu = world_from_imu_world(imu.imu_up, imu.heading_deg) @ mean
-    world_from_bone = Rotation.from_euler("y", subject.tpose_facing_deg, degrees=True).as_matrix()
-    return world_from_bone.T @ world_from_imu
 
 
 def solve_times_s(

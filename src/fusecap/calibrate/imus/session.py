@@ -26,13 +26,9 @@ from fusecap.progress import Progress
 from fusecap.sources.imu_calibration_files import CalibratedImu
 from fusecap.sources.imu_files.track import ImuTrack
 from fusecap.sources.session import ImuSettings, Session, SubjectSettings
-from fusecap.sources.session_data import (
-    SessionData,
-    open_imus,
-    open_session,
-    session_clocks,
-    with_detections,
-)
+from fusecap.sources.session_cameras import with_detections
+from fusecap.sources.session_data import SessionData, open_session, session_clocks
+from fusecap.sources.session_sensors import open_imus
 from fusecap.take import Take
 from fusecap.types import Detections
 

@@ -31,14 +31,13 @@ from fusecap.geometry.camera import Rig
 from fusecap.progress import Progress
 from fusecap.sources.keypoint_files import KeypointTrack
 from fusecap.sources.session import Session, SubjectSettings
-from fusecap.sources.session_data import (
-    SessionData,
+from fusecap.sources.session_cameras import (
     common_landmarks,
     open_keypoints,
     open_rig,
-    solve_times_s,
     with_detections,
 )
+from fusecap.sources.session_data import SessionData, solve_times_s
 from fusecap.sources.sync_files import Clock, Clocks
 from fusecap.take import Take
 

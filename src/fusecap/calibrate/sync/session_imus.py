@@ -29,7 +29,7 @@ from fusecap.geometry.quaternions import from_wxyz
 from fusecap.progress import Progress
 from fusecap.sources.imu_files import ImuTrack
 from fusecap.sources.session import Session, SubjectSettings
-from fusecap.sources.session_data import open_imus
+from fusecap.sources.session_sensors import open_imus
 from fusecap.take import Take
 
 SAME_CLOCK_S = 0.06

@@ -28,7 +28,7 @@ from fusecap.sources.live_address import (
 )
 from fusecap.sources.live_sensor import SensorAddress
 from fusecap.sources.session import CameraSettings, Session
-from fusecap.sources.session_data import open_rig
+from fusecap.sources.session_cameras import open_rig
 
 Feeds = dict[str, list[SensorFeed]]
 """By the name that the sender calls a sensor."""

@@ -27,7 +27,9 @@ from fusecap.live.devices.source import Deliver, Delivery, SessionClock, Source
 from fusecap.progress import Progress
 from fusecap.sources.keypoint_files import read_keypoints
 from fusecap.sources.session import CameraSettings, Session
-from fusecap.sources.session_data import common_landmarks, open_imus, session_clocks
+from fusecap.sources.session_cameras import common_landmarks
+from fusecap.sources.session_data import session_clocks
+from fusecap.sources.session_sensors import open_imus
 from fusecap.sources.video import Video
 from fusecap.types import ImuSample
 

@@ -1,0 +1,139 @@
+"""A session's cameras: their calibration, and keypoints on the cameras' own clocks."""
+
+from __future__ import annotations
+
+from fusecap.body.landmarks import LandmarkSet, landmark_set_named
+from fusecap.errors import SessionError
+from fusecap.findings import Finding
+from fusecap.geometry.camera import Rig
+from fusecap.progress import Progress
+from fusecap.sources.calibration_files import check_rig, load_rig
+from fusecap.sources.detection_files import read_record
+from fusecap.sources.keypoint_files import KeypointTrack, read_keypoints
+from fusecap.sources.offset_files import read_offsets
+from fusecap.sources.session import CameraSettings, Session
+
+
+def with_detections(session: Session) -> Session:
+    """The session with what `fusecap detect` left in its folder.
+
+    A camera that names a video only gets the folder of its keypoints, where these are complete and
+    the video still has the name and size that they were made from. A session that does not state
+    its rate takes that of the first detected video.
+    """
+    cameras = tuple(_with_folder(session, camera) for camera in session.cameras)
+    settings = session.settings
+    if "rate_hz" not in settings.model_fields_set:
+        records = [read_record(c.keypoints) for c in cameras if c.keypoints and not c.rate_hz]
+        rates_hz = [record.video.rate_hz for record in records if record is not None]
+        if rates_hz:
+            settings = settings.model_copy(update={"rate_hz": rates_hz[0]})
+    return session.model_copy(update={"cameras": cameras, "settings": settings})
+
+
+def _with_folder(session: Session, camera: CameraSettings) -> CameraSettings:
+    if camera.keypoints is not None or camera.video is None:
+        return camera
+    folder = session.detection_folder(camera)
+    record = read_record(folder)
+    if record is None or not record.complete or not record.video.is_likely(camera.video):
+        return camera
+    return camera.model_copy(update={"keypoints": folder})
+
+
+def open_rig(session: Session) -> tuple[Rig, list[Finding]]:
+    """The session's cameras in its order, and what is odd about them.
+
+    Raises `SessionError` for cameras without a calibration.
+    """
+    if not session.cameras:
+        return Rig(cameras=()), []
+    if session.settings.calibration is None:
+        raise SessionError(
+            f"{session.path}: [session] calibration is missing; cameras need a calibration file, "
+            "as fusecap calibrate extrinsics writes it"
+        )
+    rig = load_rig(
+        session.settings.calibration,
+        up=session.settings.up,
+        unit=session.settings.calibration_unit,
+    ).subset([camera.name for camera in session.cameras])
+    return rig, check_rig(rig, floor=session.settings.floor)
+
+
+def common_landmarks(session: Session) -> LandmarkSet | None:
+    """The one landmark set of all cameras, with the session's offsets; None without cameras.
+
+    Raises `SessionError` when cameras differ, `InputError` for offsets that cannot be used.
+    """
+    names = {camera.name: _landmark_set_name(session, camera) for camera in session.cameras}
+    if len(set(names.values())) > 1:
+        listed = ", ".join(f"'{camera}' openpose-{name}" for camera, name in names.items())
+        raise SessionError(
+            f"{session.path}: cameras with different keypoint formats ({listed}); "
+            "expected one format for all: run the same detector on every camera"
+        )
+    if not names:
+        return None
+    landmarks = landmark_set_named(next(iter(names.values())))
+    if session.settings.landmark_offsets is None:
+        return landmarks
+    return landmarks.calibrated(read_offsets(session.settings.landmark_offsets, landmarks.name))
+
+
+def _landmark_set_name(session: Session, camera: CameraSettings) -> str:
+    """The set that a detection left in the camera's folder, else that of its format."""
+    record = read_record(camera.keypoints) if camera.keypoints else None
+    if record is None:
+        return camera.landmark_set_name
+    if "format" in camera.model_fields_set and record.landmark_set != camera.landmark_set_name:
+        raise SessionError(
+            f"{session.path}: camera '{camera.name}' states format = \"{camera.format}\", but "
+            f"{camera.keypoints} holds openpose-{record.landmark_set}; leave format out"
+        )
+    return record.landmark_set
+
+
+def open_keypoints(session: Session, progress: Progress | None = None) -> tuple[KeypointTrack, ...]:
+    """Of all cameras, on their own clocks; raises `InputError`."""
+    landmarks = common_landmarks(session)
+    return tuple(
+        _keypoints(session, index, landmarks, progress) for index in range(len(session.cameras))
+    )
+
+
+def _keypoints(
+    session: Session, index: int, landmarks: LandmarkSet | None, progress: Progress | None
+) -> KeypointTrack:
+    camera = session.cameras[index]
+    if camera.keypoints is None and camera.video is None:
+        raise SessionError(
+            f"{session.path}: camera '{camera.name}' is live only, nothing is recorded here; solve "
+            "a recording of fusecap live (.mcap), or name keypoints or a video"
+        )
+    if camera.keypoints is None or landmarks is None:
+        raise SessionError(
+            f"{session.path}: camera '{camera.name}' has a video but no keypoints yet; run: "
+            f"fusecap detect {session.folder}"
+        )
+    return read_keypoints(
+        camera.keypoints,
+        name=camera.name,
+        landmarks=landmarks,
+        rate_hz=session.camera_rate_hz(camera),
+        offset_s=camera.offset_s,
+        own_times=camera.rate_hz is None,
+        progress=progress,
+    )
+
+
+def broken_files(track: KeypointTrack) -> Finding:
+    """The finding for unreadable keypoint files."""
+    share = len(track.broken) / len(track.frames)
+    return Finding(
+        severity="warning",
+        where=f"camera '{track.name}'",
+        found=f"{len(track.broken)} of {len(track.frames)} keypoint files ({share:.1%}) are "
+        f"truncated or garbled (first: {track.broken[0]})",
+        remedy="they count as frames without people; run the detector again on these frames",
+    )

@@ -1,0 +1,113 @@
+"""A session's sensors: their samples on one clock, how they sit on bones, what is odd."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from fusecap.errors import SessionError
+from fusecap.findings import Finding
+from fusecap.geometry.quaternions import from_wxyz
+from fusecap.sources.imu_files import ImuTrack, read_imu
+from fusecap.sources.session import ImuSettings, SubjectSettings
+from fusecap.sources.synchronizer import MountedImu, world_from_imu_world
+
+
+def open_imus(subject: SubjectSettings) -> list[ImuTrack]:
+    """The subject's tracks on the session's clock.
+
+    Sensors that share a recorder's clock keep their mutual delays: the earliest starts at 0.
+    """
+    tracks = []
+    for imu in subject.imus:
+        if imu.file is None:
+            raise SessionError(
+                f"imu '{imu.bone}' of '{subject.name}' is live only; name a file of its samples, "
+                "or use: fusecap live"
+            )
+        tracks.append(read_imu(imu.file, format=imu.format, sensor=imu.sensor, rate_hz=imu.rate_hz))
+    delays = _shared_delays_s(tracks)
+    return [
+        replace(track, times_s=track.times_s + delay + imu.offset_s)
+        for track, delay, imu in zip(tracks, delays, subject.imus, strict=True)
+    ]
+
+
+def _shared_delays_s(tracks: list[ImuTrack]) -> list[float]:
+    delays = [0.0] * len(tracks)
+    for period_s in {track.clock.period_s for track in tracks if track.clock}:
+        group = [i for i, t in enumerate(tracks) if t.clock and t.clock.period_s == period_s]
+        starts = np.array([t.clock.start_s for i, t in enumerate(tracks) if i in group and t.clock])
+        behind = np.mod(starts - starts[0] + period_s / 2, period_s) - period_s / 2
+        for i, delay in zip(group, behind - behind.min(), strict=True):
+            delays[i] = float(delay)
+    return delays
+
+
+def sensor_notes(subject: SubjectSettings, tracks: Sequence[ImuTrack | None]) -> list[Finding]:
+    """What was dealt with in a subject's sensor files; None for a file that was not read.
+
+    Lost samples are one finding per subject: radio drops some of nearly every sensor's.
+    """
+    findings, lost = [], []
+    for imu, track in zip(subject.imus, tracks, strict=True):
+        for note in () if track is None else track.notes:
+            if "samples lost" in note:
+                lost.append((imu.bone, note))
+            else:
+                where = f"imu '{imu.bone}' of '{subject.name}'"
+                findings.append(Finding(severity="warning", where=where, found=note, remedy=""))
+    if lost:
+        each = ", ".join(f"{bone} {note.replace(' samples lost', '')}" for bone, note in lost)
+        alone = len(lost) == 1
+        findings.append(
+            Finding(
+                severity="warning",
+                where=f"imu '{lost[0][0]}' of '{subject.name}'"
+                if alone
+                else f"sensors of '{subject.name}'",
+                found=lost[0][1] if alone else f"samples lost: {each}",
+                remedy="gaps over 0.1 s are not bridged",
+            )
+        )
+    return findings
+
+
+def mount(subject: SubjectSettings, tracks: list[ImuTrack]) -> list[MountedImu]:
+    """Sensors with their offsets; `bone_from_imu` from the T-pose where it is not given."""
+    return [
+        MountedImu(
+            bone=imu.bone,
+            track=track,
+            world_from_imu_world=world_from_imu_world(imu.imu_up, imu.heading_deg),
+            bone_from_imu=_bone_from_imu(subject, imu, track),
+            position_in_bone_m=np.array(imu.position_m),
+        )
+        for imu, track in zip(subject.imus, tracks, strict=True)
+    ]
+
+
+def _bone_from_imu(subject: SubjectSettings, imu: ImuSettings, track: ImuTrack) -> np.ndarray:
+    where = f"imu '{imu.bone}' of '{subject.name}'"
+    if imu.bone_from_imu_wxyz is not None:
+        return from_wxyz(imu.bone_from_imu_wxyz).as_matrix()
+    if subject.tpose_s is None:
+        raise SessionError(
+            f"{where}: how it sits on the bone is not known; fusecap calibrate imu finds it from "
+            "motion the cameras saw, tpose_s states when the subject stands in the T-pose, "
+            "bone_from_imu_wxyz = [1, 0, 0, 0] a sensor whose axes are the bone's"
+        )
+    start_s, end_s = subject.tpose_s
+    inside = (track.times_s >= start_s) & (track.times_s <= end_s)
+    if not inside.any():
+        raise SessionError(
+            f"{where}: no sample in tpose_s = [{start_s:g}, {end_s:g}]; its samples run from "
+            f"{track.times_s[0]:g} to {track.times_s[-1]:g} s"
+        )
+    mean = from_wxyz(track.orientation_wxyz[inside]).mean().as_matrix()
+    world_from_imu = world_from_imu_world(imu.imu_up, imu.heading_deg) @ mean
+    world_from_bone = Rotation.from_euler("y", subject.tpose_facing_deg, degrees=True).as_matrix()
+    return world_from_bone.T @ world_from_imu
