@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,8 +14,10 @@ from pathlib import Path
 
 import pytest
 
+import fusecap
 from fusecap.errors import InputError
-from fusecap.evaluate.runner import cell_key, run_cells
+from fusecap.evaluate.code_version import code_hash, versions_of
+from fusecap.evaluate.runner import _same_code, cell_key, run_cells
 from grid_cells import Square, cube, not_a_number, square
 
 TESTS = Path(__file__).parent
@@ -58,6 +61,82 @@ def test_a_key_changes_with_the_cell_the_work_and_the_versions():
     }
     assert len(keys) == 5
     assert cell_key(Square(number=1), square, dict(versions)) in keys
+
+
+@pytest.fixture(scope="module")
+def package(tmp_path_factory):
+    copy = tmp_path_factory.mktemp("tree") / "fusecap"
+    ignored = shutil.ignore_patterns("__pycache__")
+    return shutil.copytree(Path(fusecap.__file__).parent, copy, ignore=ignored)
+
+
+@pytest.mark.parametrize(
+    ("edited", "changes"),
+    [
+        ("evaluate/cells.py", True),
+        ("sources/synchronizer.py", True),
+        ("sources/__init__.py", True),
+        ("kernels/terms/position.py", True),
+        ("batch/solve.py", True),
+        ("__init__.py", True),
+        # Imported inside a function, by its name in a table, beside a name for type checkers.
+        ("sources/calibration_files/loader.py", True),
+        ("sources/imu_files/formats/mvnx.py", True),
+        ("data/twin_motion.npz", True),
+        ("viewer/take.py", False),
+        ("cli/evaluate_twin.py", False),
+        ("evaluate/runner.py", False),
+        ("evaluate/experiments/table1.py", False),
+        ("live/run.py", False),
+    ],
+)
+def test_the_version_of_a_cells_code_changes_with_what_it_imports_alone(package, edited, changes):
+    start, path = package / "evaluate/cells.py", package / edited
+    before, content = code_hash(start, package), path.read_bytes()
+    path.write_bytes(content + b"\n")
+    assert (code_hash(start, package) != before) == changes
+    path.write_bytes(content)
+    assert code_hash(start, package) == before
+
+
+def test_imports_in_functions_and_of_names_are_followed_and_those_for_types_are_not(tmp_path):
+    package, start = tmp_path / "fusecap", tmp_path / "work.py"
+    (package / "inner").mkdir(parents=True)
+    files = {
+        "__init__.py": "",
+        "inner/__init__.py": "from fusecap.named import VALUE",
+        "inner/module.py": "import fusecap.plain",
+        "named.py": "VALUE = 1",
+        "plain.py": "",
+        "types.py": "",
+        "unused.py": "",
+    }
+    for name, text in files.items():
+        (package / name).write_text(text)
+    start.write_text(
+        "if TYPE_CHECKING:\n    from fusecap.types import A\n"
+        "def work(cell):\n    from fusecap.inner import module\n"
+    )
+    matters = set()
+    for name, text in files.items():
+        before = code_hash(start, package)
+        (package / name).write_text(text + "#")
+        if code_hash(start, package) != before:
+            matters.add(name)
+    assert matters == set(files) - {"types.py", "unused.py"}
+
+
+def test_python_and_the_libraries_are_part_of_the_version():
+    assert {"code", "python", "numpy", "scipy", "numba"} == set(versions_of(square))
+    assert versions_of(square)["code"] == versions_of(cube)["code"]
+
+
+def test_a_node_with_other_code_or_libraries_computes_nothing():
+    versions = versions_of(cube)
+    assert _same_code(cube, Square(number=2), versions)[:2] == ({"cube": 8}, "")
+    numpy = versions["numpy"]
+    result, error, _ = _same_code(cube, Square(number=2), versions | {"numpy": "1.0"})
+    assert result is None and error == f"this node has numpy {numpy}, not 1.0"
 
 
 def test_a_failing_cell_is_reported_and_the_rest_is_kept(tmp_path):

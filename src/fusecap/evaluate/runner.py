@@ -5,8 +5,9 @@
 
 A cell is a frozen dataclass of plain values and `work(cell)` a module-level function that returns
 plain values. The key is a hash of the cell, of the function's name and of the versions that the
-result depends on, so a result is used again exactly when it would come out the same. A cell that
-fails is reported and not written: the next run tries it again. The rest of the grid is kept.
+result depends on (`code_version`), so a result is used again exactly when it would come out the
+same. A cell that fails is reported and not written: the next run tries it again. The rest of the
+grid is kept.
 """
 
 from __future__ import annotations
@@ -25,13 +26,11 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from functools import cache
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import fusecap
 from fusecap.errors import InputError
+from fusecap.evaluate.code_version import versions_of
 from fusecap.files import written_whole
 
 Work = Callable[[Any], dict[str, Any]]
@@ -44,16 +43,6 @@ _ONE_THREAD: dict[str, str] = {
     "MKL_NUM_THREADS": "1",
     "NUMBA_NUM_THREADS": "1",
 }
-_NOT_IN_RESULTS = (
-    "__main__.py",
-    "cli.py",
-    "evaluate/experiments/",
-    "evaluate/runner.py",
-    "evaluate/tables.py",
-    "sinks/bvh.py",
-    "sinks/plot.py",
-    "sources/",
-)
 _FORMAT = "fusecap cell 1"
 
 
@@ -86,9 +75,9 @@ def run_cells(
 
     `workers` processes (all cores unless told), each with one thread for its arrays; or the Ray
     cluster at address `ray`, "local" for one on this machine. `folder` keeps one JSON file per
-    finished cell. `versions` are added to that of the code in each key.
+    finished cell. `versions` are added to those of the code and its libraries in each key.
     """
-    versions = {"code": code_version(), **(versions or {})}
+    versions = {**versions_of(work), **(versions or {})}
     keys = [cell_key(cell, work, versions) for cell in cells]
     outcomes: dict[str, Outcome] = {}
     waiting: dict[str, Any] = {}
@@ -125,19 +114,6 @@ def cell_key(cell: Any, work: Work, versions: Mapping[str, str]) -> str:
     }
     text = json.dumps(content, sort_keys=True, allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()[:20]
-
-
-@cache
-def code_version() -> str:
-    """Version of the package and a hash of its code and data, but for what only shows results."""
-    root = Path(fusecap.__file__).parent
-    digest = hashlib.sha256()
-    for path in sorted(root.rglob("*")):
-        name = path.relative_to(root).as_posix()
-        if path.suffix not in (".py", ".npz", ".json") or name.startswith(_NOT_IN_RESULTS):
-            continue
-        digest.update(name.encode() + b"\0" + path.read_bytes() + b"\0")
-    return f"{metadata.version('fusecap')}+{digest.hexdigest()[:12]}"
 
 
 def _read(path: Path) -> dict[str, Any] | None:
@@ -284,8 +260,8 @@ def _on_ray(
     try:
         # A task whose worker dies is not repeated: its cell fails, as on our own cores.
         task = ray.remote(num_cpus=1, max_retries=0)(_same_code)
-        version = code_version()
-        flying = {task.remote(work, cell, version): key for key, cell in waiting.items()}
+        versions = versions_of(work)
+        flying = {task.remote(work, cell, versions): key for key, cell in waiting.items()}
         while flying:
             for reference in ray.wait(list(flying))[0]:
                 try:
@@ -298,8 +274,16 @@ def _on_ray(
         ray.shutdown()
 
 
-def _same_code(work: Work, cell: Any, version: str) -> tuple[dict[str, Any] | None, str, float]:
-    """`_timed` on a node that runs the code which the key names."""
-    if code_version() != version:
-        return None, f"this node has fusecap {code_version()}, not {version}", 0.0
+def _same_code(
+    work: Work, cell: Any, versions: Mapping[str, str]
+) -> tuple[dict[str, Any] | None, str, float]:
+    """`_timed` on a node that runs the code and the libraries which the key names."""
+    here = versions_of(work)
+    differ = [
+        f"{name} {here[name]}, not {versions[name]}"
+        for name in here
+        if here[name] != versions[name]
+    ]
+    if differ:
+        return None, f"this node has {'; '.join(differ)}", 0.0
     return _timed(work, cell)

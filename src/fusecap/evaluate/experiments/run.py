@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from fusecap.evaluate.cells import solve_cell
+from fusecap.evaluate.code_version import code_version
 from fusecap.evaluate.experiments.experiment import (
     Experiment,
     Finding,
@@ -27,7 +28,7 @@ from fusecap.evaluate.experiments.table2 import TABLE2
 from fusecap.evaluate.experiments.table3 import TABLE3
 from fusecap.evaluate.experiments.table4 import TABLE4
 from fusecap.evaluate.experiments.tuning import TUNING
-from fusecap.evaluate.runner import OnOutcome, Outcome, code_version, run_cells
+from fusecap.evaluate.runner import OnOutcome, Outcome, run_cells
 from fusecap.evaluate.twin import TWIN_VERSION
 from fusecap.files import plain, written_whole
 
@@ -119,8 +120,9 @@ def markdown(evaluation: Evaluation) -> str:
     lines = [
         f"## {evaluation.experiment.title}: simulated twin v{TWIN_VERSION}",
         "",
-        f"`{evaluation.command}`, {datetime.now(UTC):%Y-%m-%d}, fusecap {code_version()}, seed "
-        f"{settings.seed}, weights: {settings.weights}, scenes: {', '.join(scenes)}."
+        f"`{evaluation.command}`, {datetime.now(UTC):%Y-%m-%d}, "
+        f"fusecap {code_version(solve_cell)}, seed {settings.seed}, weights: {settings.weights}, "
+        f"scenes: {', '.join(scenes)}."
         " **Simulated**: no camera, sensor or person was there; see docs/simulation.md.",
         "",
     ]
@@ -143,7 +145,7 @@ def as_json(evaluation: Evaluation) -> dict[str, Any]:
             "title": evaluation.experiment.title,
             "simulated": True,
             "twin_version": TWIN_VERSION,
-            "code_version": code_version(),
+            "code_version": code_version(solve_cell),
             "date": f"{datetime.now(UTC):%Y-%m-%d}",
             "command": evaluation.command,
             "settings": asdict(evaluation.settings),
