@@ -43,6 +43,7 @@ from fusecap.sources.imu_files.track import GRAVITY_M_S2, ImuTrack
 from fusecap.sources.session import ImuSettings, SubjectSettings
 from fusecap.sources.session_file import load_session
 from fusecap.take import take_from_theta
+from fusecap.types import GRAVITY_M_S2
 from session_files import edit
 
 BONES = ("hips", "left_forearm", "left_thigh", "right_thigh", "left_shank", "right_shank")

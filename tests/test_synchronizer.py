@@ -15,13 +15,13 @@ from fusecap.sources.session_data import open_session
 from fusecap.sources.session_file import load_session
 from fusecap.sources.session_sensors import open_imus
 from fusecap.sources.synchronizer import (
-    GRAVITY_M_S2,
     MountedImu,
     people_at,
     readings_at,
     resample_imus,
     world_from_imu_world,
 )
+from fusecap.types import GRAVITY_M_S2
 from session_files import write_session
 
 COCO = landmark_set_named("coco17")

@@ -22,6 +22,9 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from fusecap.body.shape import BodyShape
 
+GRAVITY_M_S2 = 9.80665
+"""Standard gravity; the paper prints 9.8707 [1, sec. 3.2.3]."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImuReading:

@@ -1,8 +1,10 @@
-"""A recorded session to a take, in two passes.
+"""A recorded session to a take: sort, solve, then smooth.
 
 The first pass sorts and solves every instant as a live run would, and learns the bodies of people
 nobody measured. The second solves each subject again from the keypoints it was assigned, with one
 body throughout, and from the instant it was first seen rather than the one it was confirmed at.
+Then all instants of a subject are solved together (`fusecap.solve.window_solver`), which makes a
+motion of poses; with no term between instants in the weights that is left out.
 
 Interrupted (Ctrl-C), either pass ends at the instant it had reached and the take holds what was
 solved.
@@ -13,20 +15,30 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from fusecap.body.pose import forward_kinematics
 from fusecap.body.shape import BodyShape
 from fusecap.files import plain
 from fusecap.pipeline import Pipeline, observation_of
 from fusecap.progress import Progress
 from fusecap.setup import Setup, setup_of
 from fusecap.solve.reprojection import Reprojection
+from fusecap.solve.window_solver import WindowSolver
 from fusecap.sources.session_data import SessionData
 from fusecap.take import Take, TakeBuilder, provenance
-from fusecap.types import Detections, Estimate, ImuReading, TrackState, TrackUpdate
+from fusecap.types import (
+    Detections,
+    Estimate,
+    ImuReading,
+    Observation,
+    Status,
+    TrackState,
+    TrackUpdate,
+)
 
 
 @runtime_checkable
@@ -132,21 +144,27 @@ def solve_instants(
         ),
     )
     second = _SecondPass(setup, pipeline, tracked)
+    times_ns: list[int] = []
     solve_s, statuses = [], Counter()
     interrupted = tracked.interrupted
     try:
         for instant, updates in enumerate(tracked.updates):
             detections = instants.detections(instant)
-            estimates = second.step(detections, instants.readings(instant), updates)
-            builder.add(detections.timestamp_ns, [estimate for estimate, _ in estimates])
-            for estimate, keypoints in estimates:
-                reprojection.add(estimate, keypoints)
+            times_ns.append(detections.timestamp_ns)
+            for estimate in second.step(detections, instants.readings(instant), updates):
                 solve_s.append(estimate.solve_s)
                 statuses[estimate.status.name.lower()] += 1
             if progress:
                 progress("solving", instant + 1, len(tracked.updates))
+        if setup.options.weights.between_instants:
+            second.smooth(progress)
     except KeyboardInterrupt:
         interrupted = True
+    for timestamp_ns in times_ns:
+        estimates = second.solved.get(timestamp_ns, [])
+        builder.add(timestamp_ns, [estimate for estimate, _ in estimates])
+        for estimate, observation in estimates:
+            reprojection.add(estimate, observation.keypoints)
     take = builder.build()
     solve_ms = np.array(solve_s or [np.nan]) * 1e3
     return Solved(
@@ -222,9 +240,11 @@ def _named(updates: tuple[TrackUpdate, ...], names: Mapping[int, str]) -> list[T
 
 
 class _SecondPass:
-    """Solves people from assignments that stand."""
+    """Solves people from assignments that stand, then each one's instants together."""
 
     def __init__(self, setup: Setup, pipeline: Pipeline, tracked: _Tracked) -> None:
+        self.solved: dict[int, list[tuple[Estimate, Observation]]] = {}
+        """By timestamp, each estimate with what it was solved from."""
         self._landmark_count = len(setup.landmarks.landmark_names)
         self._estimators = {}
         for name, shape in tracked.shapes.items():
@@ -237,18 +257,52 @@ class _SecondPass:
         detections: Detections,
         readings: Mapping[str, ImuReading],
         updates: Sequence[TrackUpdate],
-    ) -> list[tuple[Estimate, np.ndarray]]:
-        """Estimates, each with the keypoints (C, K, 3) it was solved from."""
-
-        def solve(update: TrackUpdate) -> tuple[Estimate, np.ndarray] | None:
-            estimator = self._estimators[update.name]
+    ) -> list[Estimate]:
+        """One instant, every subject alone."""
+        solved = []
+        for update in updates:
             observation = observation_of(
                 update, detections, self._landmark_count, readings.get(update.name)
             )
-            estimate = estimator.follow(update.track_id, observation, update.landmarks_in_world_m)
-            return estimate and (estimate, observation.keypoints)
+            estimate = self._estimators[update.name].follow(
+                update.track_id, observation, update.landmarks_in_world_m
+            )
+            if estimate is not None:
+                solved.append((estimate, observation))
+        self.solved[detections.timestamp_ns] = solved
+        return [estimate for estimate, _ in solved]
 
-        return [solved for solved in map(solve, updates) if solved]
+    def smooth(self, progress: Progress | None) -> None:
+        """Replace the poses by those of the motion that they belong to; one subject at a time."""
+        for done, (name, estimator) in enumerate(self._estimators.items()):
+            if progress:
+                progress("smoothing", done, len(self._estimators))
+            rows = [
+                (times_ns, index)
+                for times_ns, people in self.solved.items()
+                for index, (estimate, _) in enumerate(people)
+                if estimate.name == name and estimate.status is not Status.DIVERGED
+            ]
+            own = [self.solved[times_ns][index] for times_ns, index in rows]
+            if not own:
+                continue
+            theta = WindowSolver(estimator.solver).smooth(
+                np.stack([estimate.theta for estimate, _ in own]),
+                [observation for _, observation in own],
+            )
+            position, rotation = forward_kinematics(estimator.shape, theta)
+            for k, ((times_ns, index), (estimate, observation)) in enumerate(
+                zip(rows, own, strict=True)
+            ):
+                smoothed = replace(
+                    estimate,
+                    theta=theta[k],
+                    bone_position_in_world_m=position[k],
+                    bone_rotation_in_world=rotation[k],
+                )
+                self.solved[times_ns][index] = (smoothed, observation)
+        if progress:
+            progress("smoothing", len(self._estimators), len(self._estimators))
 
 
 def describe_subjects(take: Take) -> dict[str, dict[str, float]]:

@@ -10,10 +10,11 @@ from fusecap.errors import FusecapError
 from fusecap.findings import Findings
 from fusecap.geometry.quaternions import from_wxyz
 from fusecap.sources.imu_files import read_imu
-from fusecap.sources.imu_files.track import GRAVITY_M_S2, ImuTrack
+from fusecap.sources.imu_files.track import ImuTrack
 from fusecap.sources.session import ImuSettings, Session
 from fusecap.sources.session_sensors import mount, sensor_notes
 from fusecap.sources.sync_files import Clocks
+from fusecap.types import GRAVITY_M_S2
 
 
 def check_imus(session: Session, clocks: Clocks, findings: Findings) -> list[ImuTrack | None]:

@@ -25,9 +25,9 @@ from fusecap.body.pose import forward_kinematics
 from fusecap.body.shape import BodyShape, end_offsets_m
 from fusecap.evaluate.noise import bursts, correlated_noise
 from fusecap.geometry.quaternions import to_wxyz
-from fusecap.sources.imu_files.track import GRAVITY_M_S2, ImuTrack
+from fusecap.sources.imu_files.track import ImuTrack
 from fusecap.sources.synchronizer import MountedImu, resample_imus
-from fusecap.types import ImuReading
+from fusecap.types import GRAVITY_M_S2, ImuReading
 
 IMUS_13 = (
     "hips",

@@ -22,6 +22,9 @@ class Weights(NamedTuple):
     projection: Any
     deviation: Any
     floor: Any
+    motion: Any
+    increment: Any
+    specific_force: Any
 
 
 class Body(NamedTuple):
@@ -87,6 +90,22 @@ class Measured(NamedTuple):
     dt: Any
 
 
+class Window(NamedTuple):
+    """N instants.
+
+    Keypoints (N, C, K, 3); sensor rotations (N, I, 3, 3), present (N, I) or not, specific force in
+    the bone's frame (N, I, 3); steps between instants (N - 1,) [s]; steadiness (1 + B,) of the
+    root's place and of every joint, one over the variance of their changes of velocity.
+    """
+
+    keypoints: Any
+    rotation: Any
+    present: Any
+    force: Any
+    steps: Any
+    steadiness: Any
+
+
 class Posed(NamedTuple):
     """A posed body: joints (B, 3), rotations and twists (B, 3, 3); see `kinematics.forward`."""
 
@@ -96,7 +115,10 @@ class Posed(NamedTuple):
 
 
 class Gathered(NamedTuple):
-    """Information (B, 6, 6) and gradient (B, 6) per bone; see `information`."""
+    """Information (B, 6, 6) and gradient (B, 6) per bone; see `information`.
+
+    Of a window (N, 3, B, 6, 6) and (N, B, 6): [t, k] couples the instants t and t - k.
+    """
 
     information: Any
     gradient: Any
@@ -117,6 +139,7 @@ class Scratch(NamedTuple):
 
 
 _vector, _matrix, _cube = f8[::1], f8[:, ::1], f8[:, :, ::1]
+_cubes = f8[:, :, :, ::1]
 _bones = i8[::1]
 _GROUPS = (types.NamedTuple, types.NamedUniTuple)
 
@@ -138,6 +161,9 @@ MODEL = _group(Model, WEIGHTS, BODY, LANDMARKS, SENSORS, PRIOR, FLOOR)
 MEASURED = _group(Measured, _cube, _cube, _vector, _matrix, _cube, f8)
 POSED = _group(Posed, _matrix, _cube, _cube)
 GATHERED = _group(Gathered, _cube, _matrix)
+WINDOW = _group(Window, _cubes, _cubes, _matrix, _cube, _vector, _vector)
+POSED_WINDOW = _group(Posed, _cube, _cubes, _cubes)
+GATHERED_WINDOW = _group(Gathered, f8[:, :, :, :, ::1], _cube)
 SCRATCH = _group(Scratch, _matrix, _matrix, _vector, _cube, _matrix)
 
 

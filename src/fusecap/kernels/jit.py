@@ -23,6 +23,10 @@ import numba
 FINITE = 1e300
 """Every finite number of ours is below this; NaN and infinity are not."""
 
+LOSS_SCALE = 9.0
+"""k of the loss ½ k log(1 + λ‖r‖²/k) of terms whose λ is one over a variance: Cauchy's, which lets
+go beyond three standard deviations."""
+
 _log = logging.getLogger("fusecap")
 _folder = Path(__file__).parent
 _announced = False

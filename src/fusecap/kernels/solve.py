@@ -69,7 +69,9 @@ def evaluate(theta, model, measured, posed, gathered, scratch, hessian_out, grad
             weights.position, model.landmarks, measured.keypoints, posed, scratch, gathered
         )
     if weights.orientation > 0.0:
-        cost += add_orientation(weights.orientation, model.sensors, measured, posed, gathered)
+        cost += add_orientation(
+            weights.orientation, model.sensors, measured.rotation, measured.present, posed, gathered
+        )
     if weights.acceleration > 0.0:
         cost += add_acceleration(
             weights.acceleration, model.sensors, measured, posed, scratch, gathered

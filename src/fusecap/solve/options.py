@@ -7,6 +7,13 @@ from dataclasses import dataclass, field, fields
 
 from fusecap.errors import InputError, nearest
 
+SMOOTH = {"motion": 1.0, "increment": 1100.0, "specific_force": 0.01}
+"""Weights that make a motion of poses: one sigma is 0.03 rad of a sensor's turn, and 10 m/s² of its
+specific force, as flesh and straps give."""
+ROOT_NOISE_M_S2 = 30.0
+JOINT_NOISE_RAD_S2 = 120.0
+"""How fast velocities of the root and of joints change in ordinary motion: one sigma."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Weights:
@@ -31,6 +38,13 @@ class Weights:
     """Per squared standard deviation within it."""
     floor: float = 10.0
     """Per m² below the floor."""
+    motion: float = 0.0
+    """Between instants: of a change of velocity, per squared process noise (`ROOT_NOISE_M_S2`,
+    `JOINT_NOISE_RAD_S2`)."""
+    increment: float = 0.0
+    """Between instants: per rad² between a bone's turn and its sensor's."""
+    specific_force: float = 0.0
+    """Between instants: per (m/s²)² between what a sensor would feel and felt."""
 
     def __post_init__(self) -> None:
         for term in fields(self):
@@ -51,6 +65,11 @@ class Weights:
     def paper(cls) -> Weights:
         """All terms as printed."""
         return cls(orientation=1.0, acceleration=1e-3)
+
+    @property
+    def between_instants(self) -> bool:
+        """Whether any term couples instants: else each is solved alone."""
+        return max(self.motion, self.increment, self.specific_force) > 0.0
 
 
 @dataclass(frozen=True, kw_only=True)

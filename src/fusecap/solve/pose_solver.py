@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.body.prior import PosePrior
@@ -14,10 +15,11 @@ from fusecap.errors import InputError
 from fusecap.geometry.camera import Rig
 from fusecap.kernels import cholesky, groups
 from fusecap.kernels import solve as kernels
-from fusecap.solve.options import SolverOptions
-from fusecap.types import Status
+from fusecap.solve.options import JOINT_NOISE_RAD_S2, ROOT_NOISE_M_S2, SolverOptions
+from fusecap.types import GRAVITY_M_S2, Observation, Status
 
 _FLOOR_BONES = ("left_foot", "left_toes", "right_foot", "right_toes")
+_UP_M_S2 = np.array([0.0, GRAVITY_M_S2, 0.0])
 _ROOT_PRIOR_VARIANCE = np.pi**2
 """Per axis [rad²], of a root that could face anywhere: what its quality is measured against."""
 
@@ -206,6 +208,29 @@ class PoseSolver:
             accel=data.imu_accel,
             history=data.imu_history,
             dt=data.dt_s,
+        )
+
+    def window(
+        self, times_ns: Int[np.ndarray, " n"], observations: Sequence[Observation]
+    ) -> groups.Window:
+        """What `kernels.window` takes of these instants."""
+        shape = (len(observations), len(self.sites.bone))
+        rotation = np.full((*shape, 3, 3), np.nan)
+        force = np.full((*shape, 3), np.nan)
+        for t, one in enumerate(observations):
+            if one.imu is not None:
+                rotation[t] = one.imu.bone_rotation_in_world
+                felt_in_world = one.imu.accel_in_world_m_s2 + _UP_M_S2
+                force[t] = np.einsum("iab,ia->ib", rotation[t], felt_in_world)
+        noise = np.full(1 + self.skeleton.bone_count, JOINT_NOISE_RAD_S2)
+        noise[0] = ROOT_NOISE_M_S2
+        return groups.Window(
+            keypoints=np.stack([one.keypoints for one in observations]),
+            rotation=rotation,
+            present=np.isfinite(rotation[:, :, 0, 0]).astype(np.float64),
+            force=force,
+            steps=np.diff(times_ns) * 1e-9,
+            steadiness=noise**-2.0,
         )
 
     def _quality(self) -> np.ndarray:

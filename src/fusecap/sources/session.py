@@ -306,11 +306,16 @@ class WeightSettings(_Table):
     projection: NotNegative | None = None
     deviation: NotNegative | None = None
     floor: NotNegative | None = None
+    motion: NotNegative | None = None
+    increment: NotNegative | None = None
+    specific_force: NotNegative | None = None
 
 
 class EstimatorSettings(_Table):
     """`[estimator]`; None: the estimator's default."""
 
+    smooth: bool = False
+    """Solve all instants of a person together, so that takes hold a motion."""
     weights: WeightSettings = WeightSettings()
     max_iterations: Annotated[int, Field(strict=True, ge=1)] | None = None
     function_tolerance: Positive | None = None

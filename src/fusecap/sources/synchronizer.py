@@ -18,9 +18,9 @@ from scipy.spatial.transform import Rotation
 from fusecap.geometry.camera import Y_UP_FROM_Z_UP
 from fusecap.geometry.quaternions import from_wxyz
 from fusecap.geometry.same_people import same_people
-from fusecap.sources.imu_files.track import GRAVITY_M_S2, ImuTrack
+from fusecap.sources.imu_files.track import ImuTrack
 from fusecap.sources.keypoint_files import KeypointTrack
-from fusecap.types import ImuReading
+from fusecap.types import GRAVITY_M_S2, ImuReading
 
 EXACT_S = 1e-6
 """A frame this close to an instant is taken as it is."""

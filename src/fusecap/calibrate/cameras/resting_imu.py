@@ -10,7 +10,8 @@ from jaxtyping import Float
 from fusecap.errors import InputError, nearest
 from fusecap.geometry.camera import Y_UP_FROM_Z_UP
 from fusecap.geometry.quaternions import from_wxyz
-from fusecap.sources.imu_files.track import GRAVITY_M_S2, ImuTrack
+from fusecap.sources.imu_files.track import ImuTrack
+from fusecap.types import GRAVITY_M_S2
 
 AT_REST_M_S2 = 0.15
 """Standard deviation per axis of an accelerometer that lies still."""

@@ -44,8 +44,7 @@ from fusecap.geometry.quaternions import from_wxyz
 from fusecap.solve.estimator import SubjectModel
 from fusecap.solve.pose_solver import ImuSites
 from fusecap.sources.calibration_files import fields
-from fusecap.sources.imu_files.track import GRAVITY_M_S2
-from fusecap.types import ImuReading
+from fusecap.types import GRAVITY_M_S2, ImuReading
 
 RATE_HZ = 60.0
 METRES_PER_INCH = 0.0254

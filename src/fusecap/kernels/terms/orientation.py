@@ -14,7 +14,7 @@ import math
 
 from numba import float64 as f8
 
-from fusecap.kernels.groups import GATHERED, MEASURED, POSED, SENSORS
+from fusecap.kernels.groups import GATHERED, POSED, SENSORS
 from fusecap.kernels.jit import kernel
 
 
@@ -57,17 +57,17 @@ def relative_quaternion(a, b):
     return w * scale, x * scale, y * scale, z * scale
 
 
-@kernel(f8(f8, SENSORS, MEASURED, POSED, GATHERED))
-def add_orientation(weight, sensors, measured, posed, gathered):
+@kernel(f8(f8, SENSORS, f8[:, :, ::1], f8[::1], POSED, GATHERED))
+def add_orientation(weight, sensors, measured, present, posed, gathered):
     """½ Σ λ w ‖v‖²; a measured rotation is R_ig R_i R_ib⁻¹, skipped where `present` is 0."""
     cost = 0.0
     for imu in range(sensors.bone.size):
-        if not measured.present[imu] > 0.0:
+        if not present[imu] > 0.0:
             continue
         bone = sensors.bone[imu]
         r = posed.rotation[bone]
-        w, vx, vy, vz = relative_quaternion(r, measured.rotation[imu])
-        weighted = weight * measured.present[imu]
+        w, vx, vy, vz = relative_quaternion(r, measured[imu])
+        weighted = weight * present[imu]
         cost += 0.5 * weighted * (vx * vx + vy * vy + vz * vz)
         n0 = r[0, 0] * vx + r[0, 1] * vy + r[0, 2] * vz
         n1 = r[1, 0] * vx + r[1, 1] * vy + r[1, 2] * vz

@@ -12,8 +12,8 @@ import numpy as np
 
 from fusecap.errors import InputError
 from fusecap.geometry.quaternions import from_wxyz
+from fusecap.types import GRAVITY_M_S2
 
-GRAVITY_M_S2 = 9.80665
 _UNIT_TOLERANCE = 0.01
 
 

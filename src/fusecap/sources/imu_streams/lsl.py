@@ -19,7 +19,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from fusecap.errors import InputError, nearest
-from fusecap.sources.imu_files.track import GRAVITY_M_S2
 from fusecap.sources.live_address import wrong_address
 from fusecap.sources.live_sensor import (
     SensorAddress,
@@ -28,6 +27,7 @@ from fusecap.sources.live_sensor import (
     checked_accel,
     checked_orientation,
 )
+from fusecap.types import GRAVITY_M_S2
 
 MAX_CHANNELS = 4096
 _ORIENTATION = re.compile(r"(?:q|quat|quaternion|orientation)([wxyz])$")
