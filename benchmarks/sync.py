@@ -36,7 +36,7 @@ from scipy.spatial.transform import Rotation
 from fusecap.body.landmarks import landmark_set_named
 from fusecap.calibrate.sync import session as sync_session
 from fusecap.calibrate.sync.cameras import synchronise_cameras
-from fusecap.calibrate.sync.imus import Filmed, Worn, imu_clock
+from fusecap.calibrate.sync.imus import Filmed, TimedSensor, imu_clock
 from fusecap.calibrate.sync.session import synchronise
 from fusecap.calibrate.sync.signals import view_of
 from fusecap.evaluate.imu_noise import IMUS_13
@@ -170,11 +170,11 @@ def filmed(take: Take) -> Filmed:
     )
 
 
-def worn(simulation: Simulation, wrong_s: float, drift_ppm: float = 0.0) -> list[Worn]:
+def worn(simulation: Simulation, wrong_s: float, drift_ppm: float = 0.0) -> list[TimedSensor]:
     """The sensors, on times that lack `wrong_s` and run slow by `drift_ppm`."""
     imus = simulation.imus[simulation.people[0].name]
     return [
-        Worn(
+        TimedSensor(
             bone=bone,
             times_s=(imus.times_s[imus.received[:, index]] - wrong_s) / (1 + 1e-6 * drift_ppm),
             rotation=imus.world_from_imu[imus.received[:, index], index],
@@ -262,7 +262,7 @@ def gait(data: Path) -> None:
     for bone, (sensor, _) in walk.SEGMENTS.items():
         rotation = walk.world_from_imu(folder, sensor).as_matrix()
         times_s = np.arange(len(rotation)) / walk.RATE_HZ
-        sensors[bone] = Worn(bone=bone, times_s=times_s, rotation=rotation)
+        sensors[bone] = TimedSensor(bone=bone, times_s=times_s, rotation=rotation)
     for shift_s in (0.0, -0.35, 1.2, -2.417):
         moved = [replace(each, times_s=each.times_s - shift_s) for each in sensors.values()]
         for limit_s in (10.0, abs(shift_s) + 0.4):

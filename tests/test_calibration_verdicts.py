@@ -13,7 +13,7 @@ from board_images import CHARUCO, camera, pose, seen, shots
 from fusecap.calibrate.cameras import extrinsics, extrinsics_checks, people_report
 from fusecap.calibrate.cameras.board import CHECKERBOARD, Board
 from fusecap.calibrate.cameras.bundle_adjustment import adjust, stack_views
-from fusecap.calibrate.cameras.people_report import CameraChange, Fit, PeopleCalibration
+from fusecap.calibrate.cameras.people_report import CameraChange, HeldOutFit, PeopleCalibration
 from fusecap.calibrate.cameras.report import CameraReport, ScaleCheck, verdict_of
 from fusecap.calibrate.verdict import Verdict, worst
 from fusecap.errors import CalibrationError, InputError
@@ -168,8 +168,8 @@ def test_number_beyond_all_bounds_is_refused_in_words(tmp_path):
 
 def change_of(name, **changes):
     fine = {
-        "before": Fit(median_px=12.0, p90_px=20.0, keypoints=500),
-        "after": Fit(median_px=4.0, p90_px=9.0, keypoints=500),
+        "before": HeldOutFit(median_px=12.0, p90_px=20.0, keypoints=500),
+        "after": HeldOutFit(median_px=4.0, p90_px=9.0, keypoints=500),
         "skeleton_before_px": 12.0,
         "skeleton_after_px": 6.0,
         "moved_mm": 20.0,
@@ -220,14 +220,14 @@ def test_camera_whose_repeatability_is_unknown_is_noted():
 
 
 def test_camera_that_no_keypoint_checks_is_noted():
-    nothing = Fit(median_px=np.nan, p90_px=np.nan, keypoints=0)
+    nothing = HeldOutFit(median_px=np.nan, p90_px=np.nan, keypoints=0)
     [note] = notes_of(change_of("left"), change_of("right", before=nothing, after=nothing))
     assert note.startswith("'right'") and "no held-out keypoint" in note
 
 
 def test_camera_that_pays_for_the_others_is_noted():
-    worse = Fit(median_px=4.0, p90_px=9.0, keypoints=500)
-    before = Fit(median_px=3.0, p90_px=9.0, keypoints=500)
+    worse = HeldOutFit(median_px=4.0, p90_px=9.0, keypoints=500)
+    before = HeldOutFit(median_px=3.0, p90_px=9.0, keypoints=500)
     [note] = notes_of(change_of("left"), change_of("right", before=before, after=worse))
     assert note.startswith("'right' (3.0 -> 4.0 px)")
 

@@ -13,7 +13,7 @@ from fusecap.calibrate.sync import session as sync_session
 from fusecap.calibrate.sync import session_imus
 from fusecap.calibrate.sync.cameras import synchronise_cameras
 from fusecap.calibrate.sync.curves import clustered_covariance
-from fusecap.calibrate.sync.imus import Filmed, Worn, imu_clock
+from fusecap.calibrate.sync.imus import Filmed, TimedSensor, imu_clock
 from fusecap.calibrate.sync.session import synchronise
 from fusecap.calibrate.sync.signals import common_smooth_s, smoothed, view_of
 from fusecap.calibrate.sync.stamp import find_stamp
@@ -186,7 +186,7 @@ def test_sensor_mounted_any_way_round_is_found():
     )
     mounting = Rotation.from_rotvec([0.4, -1.9, 1.1]).as_matrix()
     own_s = np.arange(0, 10, 0.01)
-    worn = Worn(bone="left_shank", times_s=own_s, rotation=at(own_s + 1.2345) @ mounting)
+    worn = TimedSensor(bone="left_shank", times_s=own_s, rotation=at(own_s + 1.2345) @ mounting)
     found = imu_clock([worn], filmed, max_offset_s=3.0)
     assert found.offset_s == pytest.approx(1.2345, abs=0.001)
     assert found.peak is not None and found.peak.distinct
@@ -198,7 +198,7 @@ def test_sensor_at_rest_tells_nothing():
     filmed = Filmed(
         name="anna", times_s=times_s, bone_names=("head",), rotation=at(times_s)[:, None]
     )
-    still = Worn(bone="head", times_s=times_s, rotation=np.repeat(np.eye(3)[None], 720, 0))
+    still = TimedSensor(bone="head", times_s=times_s, rotation=np.repeat(np.eye(3)[None], 720, 0))
     assert np.isnan(imu_clock([still], filmed, max_offset_s=3.0).offset_s)
 
 
@@ -217,7 +217,7 @@ def several_clocks(offsets_s):
     )
     own_s = np.arange(0, 10, 0.01)
     sensors = [
-        Worn(bone=b, times_s=own_s, rotation=a(own_s + o))
+        TimedSensor(bone=b, times_s=own_s, rotation=a(own_s + o))
         for a, b, o in zip(at, bones, offsets_s, strict=True)
     ]
     return subject, sensors, person
@@ -261,7 +261,7 @@ def test_sensors_are_given_to_the_people_they_fit(tmp_path):
             )
         )
         own_s = np.arange(0, 10, 0.01)
-        worn.append([Worn(bone="left_shank", times_s=own_s, rotation=at(own_s + 0.4))])
+        worn.append([TimedSensor(bone="left_shank", times_s=own_s, rotation=at(own_s + 0.4))])
     session = parse_session(write_small(tmp_path, frames=10))
     session = session.model_copy(update={"subjects": tuple(subjects)})
     starts_m = {"ben": (0.5, 0.5), "anna": (-1.0, 0.0)}
@@ -282,7 +282,7 @@ def test_drift_of_a_sensor_is_found_in_two_minutes():
         rotation=(at(times_s) @ noise)[:, None],
     )
     own_s = np.arange(0, 128, 0.01)
-    worn = Worn(bone="left_shank", times_s=own_s, rotation=at(own_s * (1 + 80e-6) + 0.3))
+    worn = TimedSensor(bone="left_shank", times_s=own_s, rotation=at(own_s * (1 + 80e-6) + 0.3))
     found = imu_clock([worn], filmed, max_offset_s=1.0)
     assert found.drift_ppm == pytest.approx(80, abs=4 * found.drift_error_ppm)
     assert found.drift_error_ppm < 15
@@ -297,7 +297,7 @@ def test_a_limbs_turn_about_itself_does_not_count():
 
     def offset_s(name):
         filmed = Filmed(name="a", times_s=times_s, bone_names=(name,), rotation=bone[:, None])
-        worn = Worn(bone=name, times_s=times_s, rotation=at(times_s))
+        worn = TimedSensor(bone=name, times_s=times_s, rotation=at(times_s))
         return imu_clock([worn], filmed, max_offset_s=1.0).offset_s
 
     # Along a shank lies y, whose turn alone is 30 ms late here.

@@ -50,7 +50,7 @@ from fusecap.types import (
     TrackUpdate,
 )
 from fusecap.viewer import tables
-from fusecap.viewer.curves import Curve
+from fusecap.viewer.curves import BoneCurve
 from fusecap.viewer.figure import Figure, Pose, pose_of
 from fusecap.viewer.floor_plan import FloorDrawing, floor_plan
 from fusecap.viewer.live import LiveViewer
@@ -483,7 +483,7 @@ def canvas_of(shown) -> np.ndarray:
 @pytest.mark.slow
 def test_a_take_is_seen_and_scrubbing_moves_it(browser):
     take = take_of(np.stack([walk(person(), 120)]), [person()], names=(NASTY,))
-    curves = [Curve(title="error (mm)", by_person={NASTY: np.ones((120, 21))})]
+    curves = [BoneCurve(title="error (mm)", by_person={NASTY: np.ones((120, 21))})]
     with page_of() as page:
         shown_take = TakePage(page, take, rig=ring(3), curves=curves)
         with in_thread(shown_take.run):

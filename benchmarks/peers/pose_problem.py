@@ -18,7 +18,7 @@ from fusecap.body.landmarks import LandmarkSet
 from fusecap.body.prior import PosePrior
 from fusecap.body.shape import BodyShape
 from fusecap.geometry.camera import Rig
-from fusecap.kernels.groups import Weights
+from fusecap.kernels.groups import TermWeights
 from fusecap.solve.options import SolverOptions
 from fusecap.solve.pose_solver import ImuSites, Measurements
 
@@ -112,7 +112,7 @@ def build_problems(
         "prior_sigma": prior.sigma,
         "floor_bone": np.array([skeleton.bone(name) for name in floor_bones]),
         "floor_radius_m": np.array([options.floor_radius_m]),
-        "weights": [getattr(options.weights, name) for name in Weights._fields],
+        "weights": [getattr(options.weights, name) for name in TermWeights._fields],
         "function_tolerance": np.array([options.function_tolerance]),
         "max_iterations": np.array([options.max_iterations]),
     }

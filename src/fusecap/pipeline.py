@@ -46,7 +46,7 @@ class Sorter(Protocol):
 
 
 @runtime_checkable
-class Cast(Protocol):
+class OpenSorter(Protocol):
     """A sorter whose subjects may change in the middle."""
 
     def reinitialise(self, name: str = "") -> None:
@@ -217,11 +217,11 @@ class Pipeline:
     @property
     def _is_full(self) -> bool:
         """Everyone there is a place for is being followed; others are bystanders."""
-        return isinstance(self._sorter, Cast) and self._sorter.is_full
+        return isinstance(self._sorter, OpenSorter) and self._sorter.is_full
 
     @staticmethod
-    def _cast(sorter: Sorter) -> Cast:
-        if isinstance(sorter, Cast):
+    def _cast(sorter: Sorter) -> OpenSorter:
+        if isinstance(sorter, OpenSorter):
             return sorter
         raise SessionError('associate = "paper" follows those it began with; use "tracker"')
 

@@ -224,7 +224,7 @@ def calibrate_session(
                 "no keypoints match the people of the truth; check that it belongs to this "
                 f"session ({data.session.path}) and that the clocks agree"
             )
-        found = Found(
+        found = FoundOffsets(
             landmarks=landmarks.calibrated(median_offsets(landmarks, samples, per_subject)),
             samples=samples,
             steps=(),
@@ -262,7 +262,7 @@ def origin(found: OffsetCalibration, truth: Path | None) -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Found:
+class FoundOffsets:
     """Calibrated landmarks, the last samples, and the rounds' mean steps in statures."""
 
     landmarks: LandmarkSet
@@ -280,7 +280,7 @@ def self_calibrate(
     detections: Sequence[Detections],
     *,
     per_subject: bool = False,
-) -> Found:
+) -> FoundOffsets:
     """Alternate `solve` and eq. 17-18; starts from `landmarks`, pulled to the defaults.
 
     Raises `InputError` when nobody is found or triangulated.
@@ -307,7 +307,7 @@ def self_calibrate(
             landmarks, samples = new, measure_offsets(rig, new, take, rows)
             steps.append(step)
             error_px.append(error)
-    return Found(
+    return FoundOffsets(
         landmarks=landmarks,
         samples=samples,
         steps=tuple(steps),

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from fusecap.calibrate.cameras.board_views import CameraShots
-from fusecap.calibrate.cameras.extrinsics import Solution
+from fusecap.calibrate.cameras.extrinsics import RigSolution
 from fusecap.calibrate.cameras.intrinsics import Intrinsics
 from fusecap.calibrate.cameras.people_report import PeopleCalibration
 from fusecap.calibrate.cameras.report import RigCalibration
@@ -99,7 +99,7 @@ def _draw_image(
     return seen
 
 
-def _draw_rig(ax: Axes, solution: Solution) -> None:
+def _draw_rig(ax: Axes, solution: RigSolution) -> None:
     """In the plane of the cameras' widest spread."""
     centres = np.array([camera.position_in_world for camera in solution.cameras])
     boards = np.array([pose[:3, 3] for pose in solution.boards.values()])

@@ -15,7 +15,7 @@ from fusecap.cli.terminal import console, wrote
 if TYPE_CHECKING:
     from fusecap.calibrate.cameras.board import Board, BoardView
     from fusecap.calibrate.cameras.resting_imu import RestingImu
-    from fusecap.calibrate.cameras.world_frame import Placement
+    from fusecap.calibrate.cameras.world_frame import NewWorld
     from fusecap.findings import Finding
     from fusecap.geometry.camera import Rig
     from fusecap.geometry.similarity import Similarity
@@ -265,7 +265,7 @@ def _report(
     rig: Rig,
     result: Rig,
     change: Similarity,
-    placement: Placement,
+    placement: NewWorld,
     imu: RestingImu | None,
     findings: list[Finding],
     files: list[Path],

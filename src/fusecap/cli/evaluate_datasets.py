@@ -17,7 +17,7 @@ from fusecap.cli.terminal import console, note, progress, table_of, wrote
 from fusecap.errors import InputError
 
 if TYPE_CHECKING:
-    from fusecap.evaluate.datasets.recording import Recording
+    from fusecap.evaluate.datasets.recording import DatasetSequence
     from fusecap.evaluate.datasets.score import TruthScore
     from fusecap.evaluate.tables import Table
 
@@ -105,7 +105,7 @@ def human36m(
     takes = {f"{take.subject} {take.action}": take for take in list_takes(folder)}
     chosen = _chosen(actions, takes, list(takes))
 
-    def recordings() -> Iterable[Recording]:
+    def recordings() -> Iterable[DatasetSequence]:
         for key in chosen:
             rig = read_rig(folder / "cameras.json", takes[key].subject)
             for cameras in [[name] for name in rig.names] if monocular else [list(rig.names)]:
@@ -141,7 +141,7 @@ def panoptic(folder: Folder, out: Out = _OUT, as_json: Json = False) -> None:
     _report(_table("CMU Panoptic", scores), out, "panoptic", as_json)
 
 
-def _scores(recordings: Iterable[Recording], as_json: bool) -> list[tuple[str, TruthScore]]:
+def _scores(recordings: Iterable[DatasetSequence], as_json: bool) -> list[tuple[str, TruthScore]]:
     from fusecap.evaluate.datasets.score import score_truth
 
     scores = []

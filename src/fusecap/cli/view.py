@@ -15,7 +15,7 @@ from fusecap.cli.terminal import console, note
 if TYPE_CHECKING:
     from fusecap.geometry.camera import Rig
     from fusecap.take import Take
-    from fusecap.viewer.curves import Curve
+    from fusecap.viewer.curves import BoneCurve
     from fusecap.viewer.page import Page
     from fusecap.viewer.recording import RecordedDetections
 
@@ -84,15 +84,15 @@ def view(
     )
 
 
-def error_curves(take: Take, truth: Take) -> list[Curve]:
+def error_curves(take: Take, truth: Take) -> list[BoneCurve]:
     """Of positions and orientations; raises `TakeError` where the two have nothing in common."""
     from fusecap.evaluate.errors_over_time import errors_over_time
-    from fusecap.viewer.curves import Curve
+    from fusecap.viewer.curves import BoneCurve
 
     errors = errors_over_time(take, truth)
     return [
-        Curve(title="position error (mm)", by_person=errors.position_mm),
-        Curve(title="orientation error (degrees)", by_person=errors.orientation_deg),
+        BoneCurve(title="position error (mm)", by_person=errors.position_mm),
+        BoneCurve(title="orientation error (degrees)", by_person=errors.orientation_deg),
     ]
 
 
@@ -101,7 +101,7 @@ def look(
     title: str,
     *,
     rig: Rig | None,
-    curves: Sequence[Curve],
+    curves: Sequence[BoneCurve],
     detections: RecordedDetections | None = None,
     host: str = "127.0.0.1",
     port: int | None = None,

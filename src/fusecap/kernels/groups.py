@@ -13,7 +13,7 @@ from numba import int64 as i8
 from numba import types
 
 
-class Weights(NamedTuple):
+class TermWeights(NamedTuple):
     """λ of each term; 0 switches it off."""
 
     position: Any
@@ -42,7 +42,7 @@ class Landmarks(NamedTuple):
     cameras: Any
 
 
-class Sensors(NamedTuple):
+class SensorSites(NamedTuple):
     """I sensors on bones (I,), their places (I, 3)."""
 
     bone: Any
@@ -151,10 +151,10 @@ def _group(kind: type, *members: Any) -> types.BaseTuple:
     return types.NamedTuple(members, kind)
 
 
-WEIGHTS = _group(Weights, *[f8] * len(Weights._fields))
+WEIGHTS = _group(TermWeights, *[f8] * len(TermWeights._fields))
 BODY = _group(Body, _bones, _matrix)
 LANDMARKS = _group(Landmarks, _bones, _matrix, _matrix)
-SENSORS = _group(Sensors, _bones, _matrix)
+SENSORS = _group(SensorSites, _bones, _matrix)
 PRIOR = _group(Prior, _vector, _matrix, _matrix)
 FLOOR = _group(Floor, _bones, f8)
 MODEL = _group(Model, WEIGHTS, BODY, LANDMARKS, SENSORS, PRIOR, FLOOR)

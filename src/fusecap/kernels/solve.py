@@ -32,8 +32,8 @@ from fusecap.kernels.groups import (
     Posed,
     Prior,
     Scratch,
-    Sensors,
-    Weights,
+    SensorSites,
+    TermWeights,
     plain_type,
 )
 from fusecap.kernels.information import assemble
@@ -115,10 +115,10 @@ def solve(
     """(status, iterations, cost). hessian[0] and gradient[0] end up at the returned pose."""
     constant = inputs[0]
     model = Model(
-        Weights(*constant[0]),
+        TermWeights(*constant[0]),
         Body(*constant[1]),
         Landmarks(*constant[2]),
-        Sensors(*constant[3]),
+        SensorSites(*constant[3]),
         Prior(*constant[4]),
         Floor(*constant[5]),
     )

@@ -57,7 +57,7 @@ class Sending(Protocol):
 
 
 @runtime_checkable
-class Recording(Protocol):
+class RecordingListener(Protocol):
     """A listener that writes a file."""
 
     def status(self) -> RecordingStatus:
@@ -145,5 +145,5 @@ class Listeners:
 
 
 def _recording(listener: Listener) -> RecordingStatus | None:
-    status = listener.status() if isinstance(listener, Recording) else None
+    status = listener.status() if isinstance(listener, RecordingListener) else None
     return status if isinstance(status, RecordingStatus) else None

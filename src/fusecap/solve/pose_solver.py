@@ -94,7 +94,7 @@ class PoseSolver:
         self.sites = sites or ImuSites.none()
         self._rig = rig.packed
         self._landmark_bone = landmarks.bones(skeleton)
-        self._sensors = groups.Sensors(
+        self._sensors = groups.SensorSites(
             bone=np.array(self.sites.bone, dtype=np.int64), offset=self.sites.position_m
         )
         self._present = np.zeros(len(self.sites.bone))
@@ -133,8 +133,8 @@ class PoseSolver:
         self.landmark_offsets_m = np.ascontiguousarray(landmark_offsets_m, dtype=np.float64)
         weights = self.options.weights
         self.model = groups.Model(
-            weights=groups.Weights(
-                *(float(getattr(weights, name)) for name in groups.Weights._fields)
+            weights=groups.TermWeights(
+                *(float(getattr(weights, name)) for name in groups.TermWeights._fields)
             ),
             body=groups.Body(
                 parents=self.skeleton.parent_array,

@@ -20,7 +20,7 @@ _HEIGHT_PX = 170
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Curve:
+class BoneCurve:
     """One value per bone and frame, for each person."""
 
     title: str
@@ -31,9 +31,9 @@ class Curve:
     """Of the axis; None: of the data."""
 
 
-def quality_curve(take: Take) -> Curve:
+def quality_curve(take: Take) -> BoneCurve:
     """0-1; the share of a bone's orientation uncertainty that data removed."""
-    return Curve(
+    return BoneCurve(
         title="bone quality (0 to 1)",
         by_person=dict(zip(take.subject_names, take.bone_quality, strict=True)),
         top=1.03,
@@ -46,7 +46,7 @@ class Plot:
     def __init__(
         self,
         gui: viser.GuiApi,
-        curve: Curve,
+        curve: BoneCurve,
         time_s: Float[np.ndarray, " t"],
         bone_names: Sequence[str],
         colours: Mapping[str, Rgb],

@@ -13,7 +13,7 @@ from fusecap.errors import TakeError
 from fusecap.geometry.camera import Rig
 from fusecap.take import Take
 from fusecap.viewer.controls import PlaybackControls
-from fusecap.viewer.curves import ALL_BONES, Curve, Plot, quality_curve
+from fusecap.viewer.curves import ALL_BONES, BoneCurve, Plot, quality_curve
 from fusecap.viewer.figure import Pose
 from fusecap.viewer.page import Page
 from fusecap.viewer.palette import css, escaped, person_rgb
@@ -37,7 +37,7 @@ class TakePage:
         take: Take,
         *,
         rig: Rig | None = None,
-        curves: Sequence[Curve] = (),
+        curves: Sequence[BoneCurve] = (),
         detections: RecordedDetections | None = None,
     ) -> None:
         if len(take.timestamps_ns) == 0:
@@ -115,7 +115,7 @@ class TakePage:
         )
 
     def _add_plots(
-        self, curves: Sequence[Curve], colours: dict[str, tuple[int, int, int]]
+        self, curves: Sequence[BoneCurve], colours: dict[str, tuple[int, int, int]]
     ) -> list[Plot]:
         gui, take = self._page.gui, self._take
         with gui.add_folder("Over time"):

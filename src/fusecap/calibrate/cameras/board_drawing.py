@@ -41,7 +41,7 @@ _TEXT_MM = 3.2
 
 
 @dataclass(frozen=True, kw_only=True)
-class Page:
+class BoardPage:
     """A board on a page, all in millimetres from the page's top left corner, y down."""
 
     name: str
@@ -52,7 +52,7 @@ class Page:
     top_mm: float
 
 
-def page_for(board: Board, name: str | None = None) -> Page:
+def page_for(board: Board, name: str | None = None) -> BoardPage:
     """The page of this name, or the first of `PAGES_MM` that holds the board, upright or lying.
 
     Raises `CalibrationError` naming a page that fits.
@@ -74,7 +74,7 @@ def page_for(board: Board, name: str | None = None) -> Page:
     )
 
 
-def draw_pdf(board: Board, page: Page) -> bytes:
+def draw_pdf(board: Board, page: BoardPage) -> bytes:
     """One page in exact millimetres: vector graphics, nothing for a viewer to resample."""
     scale = _POINTS_PER_MM
 
@@ -93,7 +93,7 @@ def draw_pdf(board: Board, page: Page) -> bytes:
     return _pdf("\n".join(content), size)
 
 
-def draw_png(board: Board, page: Page, *, dpi: float = 300.0) -> bytes:
+def draw_png(board: Board, page: BoardPage, *, dpi: float = 300.0) -> bytes:
     """The page at a stated resolution, which stands in the file (pHYs) for printing programs.
 
     Edges fall on whole pixels: a square is wrong by at most half a pixel, 0.04 mm at 300 dpi.
@@ -136,12 +136,12 @@ def board_toml(board: Board, printed: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _fit(board: Board, name: str) -> Page | None:
+def _fit(board: Board, name: str) -> BoardPage | None:
     width, height = 1e3 * board.columns * board.square_m, 1e3 * board.rows * board.square_m
     for across, down in (PAGES_MM[name], PAGES_MM[name][::-1]):
         free = down - 2 * MARGIN_MM - height - _FOOT_MM
         if across - 2 * MARGIN_MM >= max(width, RULER_MM) and free >= 0:
-            return Page(
+            return BoardPage(
                 name=name,
                 width_mm=across,
                 height_mm=down,
@@ -162,7 +162,7 @@ def _largest_square_mm(board: Board, name: str) -> int:
     return int(max(sizes))
 
 
-def _black_mm(board: Board, page: Page) -> list[tuple[float, float, float, float]]:
+def _black_mm(board: Board, page: BoardPage) -> list[tuple[float, float, float, float]]:
     """x, y, width, height of everything black on the board."""
     square = 1e3 * board.square_m
     dark = _dark_cells(board)
@@ -216,7 +216,7 @@ def _runs(line: np.ndarray) -> list[tuple[int, int]]:
     ]
 
 
-def _ruler_mm(page: Page) -> list[tuple[float, float, float, float]]:
+def _ruler_mm(page: BoardPage) -> list[tuple[float, float, float, float]]:
     """A line with a tick every 10 mm, 100 mm from the first one's outer edge to the last one's."""
     left, y = (page.width_mm - RULER_MM) / 2, page.height_mm - MARGIN_MM - 6.0
     thin = 0.25
@@ -228,7 +228,7 @@ def _ruler_mm(page: Page) -> list[tuple[float, float, float, float]]:
     return boxes
 
 
-def _texts(board: Board, page: Page) -> Sequence[tuple[str, float, float]]:
+def _texts(board: Board, page: BoardPage) -> Sequence[tuple[str, float, float]]:
     """Text, x and y of its baseline."""
     marker = f", marker {1e3 * board.marker_m:g} mm" if board.marker_m else ""
     legacy = ", legacy pattern" if board.legacy and board.kind == CHARUCO else ""

@@ -43,7 +43,7 @@ REFINED = slice(6, 12)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Solution:
+class RigSolution:
     """Cameras and boards in the first camera's frame."""
 
     cameras: tuple[Camera, ...]
@@ -70,7 +70,7 @@ def solve(
     *,
     refine_intrinsics: bool = False,
     proposals: Proposals | None = None,
-) -> Solution:
+) -> RigSolution:
     """All cameras in the frame of the first; their intrinsics are a start or, by default, fixed.
 
     `proposals`, where they are known, may be of more than `views`.
@@ -94,7 +94,7 @@ def adjusted(
     board: Board,
     *,
     refine_intrinsics: bool,
-) -> Solution:
+) -> RigSolution:
     free = np.zeros((len(cameras), PARAMETERS), dtype=bool)
     free[1:, POSE] = True
     if refine_intrinsics:
@@ -123,4 +123,4 @@ def adjusted(
         left_out = [key for key, is_bad in zip(keys, bad, strict=True) if is_bad]
         keys = [key for key, is_bad in zip(keys, bad, strict=True) if not is_bad]
         check_connected([c.name for c in cameras], {key: views[key] for key in keys})
-    return Solution(cameras=found, boards=poses, left_out=tuple(left_out), converged=converged)
+    return RigSolution(cameras=found, boards=poses, left_out=tuple(left_out), converged=converged)

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from fusecap.calibrate.cameras.board import Board, BoardView
 from fusecap.calibrate.cameras.bundle_adjustment import adjust, residuals_px, stack_views
-from fusecap.calibrate.cameras.extrinsics import Solution, adjusted, solve
+from fusecap.calibrate.cameras.extrinsics import RigSolution, adjusted, solve
 from fusecap.calibrate.cameras.first_poses import (
     Proposals,
     Views,
@@ -117,7 +117,7 @@ def held_out(
 
 
 def repeatability(
-    solution: Solution,
+    solution: RigSolution,
     views: Views,
     board: Board,
     *,

@@ -41,7 +41,7 @@ from fusecap.calibrate.cameras.people_adjust import Free, adjust, residuals_px
 from fusecap.calibrate.cameras.people_gauge import align, gauge_free, motions
 from fusecap.calibrate.cameras.people_report import (
     CameraChange,
-    Fit,
+    HeldOutFit,
     PeopleCalibration,
     better,
     fit_of,
@@ -49,7 +49,7 @@ from fusecap.calibrate.cameras.people_report import (
 )
 from fusecap.calibrate.cameras.people_rounds import (
     MIN_INSTANTS,
-    Found,
+    Alternation,
     Rounds,
     Split,
     limbs_of,
@@ -109,7 +109,9 @@ def refine_from_people(
     return _report(rounds, rough, found, used)
 
 
-def check_rigs(data: SessionData, follow: Rig, rigs: Sequence[Rig]) -> dict[str, tuple[Fit, ...]]:
+def check_rigs(
+    data: SessionData, follow: Rig, rigs: Sequence[Rig]
+) -> dict[str, tuple[HeldOutFit, ...]]:
     """Residuals of a whole session under rigs that were calibrated elsewhere, rig by rig.
 
     People are followed under `follow`, so that all rigs meet the same keypoints. Per camera, then
@@ -120,7 +122,7 @@ def check_rigs(data: SessionData, follow: Rig, rigs: Sequence[Rig]) -> dict[str,
     seen = sight(data, follow, roughness(follow, data).gates(), detections)
     residuals = np.array([_residuals(rig, seen) for rig in rigs])
 
-    def fits(parts: Float[np.ndarray, "r *n"]) -> tuple[Fit, ...]:
+    def fits(parts: Float[np.ndarray, "r *n"]) -> tuple[HeldOutFit, ...]:
         return tuple(fit_of(part) for part in parts)
 
     return {
@@ -131,7 +133,7 @@ def check_rigs(data: SessionData, follow: Rig, rigs: Sequence[Rig]) -> dict[str,
 
 
 def _report(
-    rounds: Rounds, rough: Rig, found: Found, refined: tuple[str, ...]
+    rounds: Rounds, rough: Rig, found: Alternation, refined: tuple[str, ...]
 ) -> PeopleCalibration:
     """Held-out residuals, uncertainties, verdict."""
     alignment = align(found.adjusted.state.rig, rough)
@@ -194,7 +196,7 @@ def _report(
     return replace(result, notes=notes_on(result, rough, found.rows.views))
 
 
-def _repeatability(rounds: Rounds, rough: Rig, found: Found) -> tuple[np.ndarray, np.ndarray]:
+def _repeatability(rounds: Rounds, rough: Rig, found: Alternation) -> tuple[np.ndarray, np.ndarray]:
     """Scatter of every camera's centre [m] and direction [rad] over resampled fit blocks."""
     rng = np.random.default_rng(0)
     block = rounds.split.block_of[found.rows.instant]
@@ -219,7 +221,7 @@ def _repeatability(rounds: Rounds, rough: Rig, found: Found) -> tuple[np.ndarray
     return np.sqrt((shift**2).mean(axis=0)), np.sqrt((angle**2).mean(axis=0))
 
 
-def _scale(rounds: Rounds, found: Found, rough_share: float) -> tuple[float, str]:
+def _scale(rounds: Rounds, found: Alternation, rough_share: float) -> tuple[float, str]:
     """New metres per metre of the rough calibration, and where it comes from."""
     limbs = limbs_of(rounds.landmarks)
     names = rounds.landmarks.landmark_names

@@ -132,7 +132,7 @@ class State:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Adjusted:
+class AdjustedByPeople:
     """The end of an adjustment."""
 
     state: State
@@ -291,7 +291,7 @@ def adjust(
     free: Free,
     *,
     sigma_px: float,
-) -> Adjusted:
+) -> AdjustedByPeople:
     """Adjust until the cost rests and sigma_px is the residuals'; `start` is what is trusted.
 
     `sigma_px` is where to begin: the residuals that the state has, in a 1920-pixel-wide image.
@@ -308,7 +308,7 @@ def adjust(
     steps += taken
     count = len(start) * (6 + free.intrinsics)
     reduced, _, _ = _eliminated(linear, evidence, len(start) * (6 + free.intrinsics), 0.0)
-    return Adjusted(
+    return AdjustedByPeople(
         state=state,
         sigma_px=sigma_px,
         information=_without_lengths(reduced, count),

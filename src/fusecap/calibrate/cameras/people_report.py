@@ -25,7 +25,7 @@ LEFT_PX = 8.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fit:
+class HeldOutFit:
     """Residuals of one camera on held-out instants, in its own pixels."""
 
     median_px: float
@@ -38,8 +38,8 @@ class CameraChange:
     """What happened to one camera."""
 
     name: str
-    before: Fit
-    after: Fit
+    before: HeldOutFit
+    after: HeldOutFit
     skeleton_before_px: float
     """Median distance of held-out keypoints from the solved skeleton's landmarks."""
     skeleton_after_px: float
@@ -65,9 +65,9 @@ class PeopleCalibration:
     improved: bool
     """Whether held-out keypoints say that it is better; if not, keep the old one."""
     cameras: tuple[CameraChange, ...]
-    before: Fit
+    before: HeldOutFit
     """All cameras together."""
-    after: Fit
+    after: HeldOutFit
     skeleton_before_px: float
     skeleton_after_px: float
     refined: tuple[str, ...]
@@ -98,18 +98,18 @@ class PeopleCalibration:
         return Verdict.USABLE if self.notes else Verdict.GOOD
 
 
-def fit_of(residual: np.ndarray) -> Fit:
+def fit_of(residual: np.ndarray) -> HeldOutFit:
     known = residual[np.isfinite(residual)]
     if not len(known):
-        return Fit(median_px=np.nan, p90_px=np.nan, keypoints=0)
-    return Fit(
+        return HeldOutFit(median_px=np.nan, p90_px=np.nan, keypoints=0)
+    return HeldOutFit(
         median_px=float(np.median(known)),
         p90_px=float(np.percentile(known, 90)),
         keypoints=len(known),
     )
 
 
-def better(after: Fit, before: Fit) -> bool:
+def better(after: HeldOutFit, before: HeldOutFit) -> bool:
     limit_px = min(IMPROVES * before.median_px, before.median_px - IMPROVES_PX)
     return after.median_px < limit_px
 

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.calibrate.cameras.people_adjust import (
-    Adjusted,
+    AdjustedByPeople,
     Evidence,
     Free,
     State,
@@ -83,11 +83,11 @@ class Split:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Found:
+class Alternation:
     """The end of an alternation, in the rough calibration's world."""
 
     rig: Rig
-    adjusted: Adjusted
+    adjusted: AdjustedByPeople
     evidence: Evidence
     rows: Sightings
     """Person-instants of the adjustment."""
@@ -106,7 +106,7 @@ class Rounds:
     split: Split
     progress: Progress | None
 
-    def alternate(self, rig: Rig, free: Free, trusted: Rig | None = None) -> Found:
+    def alternate(self, rig: Rig, free: Free, trusted: Rig | None = None) -> Alternation:
         """Follow, adjust, align, until the cameras rest; `trusted` is the rough calibration."""
         rough = trusted or rig
         found = None
@@ -124,7 +124,7 @@ class Rounds:
             new = adjusted.state.rig
             moved_px = _image_motion_px(rig, new, adjusted.state.points)
             rig = new
-            found = Found(
+            found = Alternation(
                 rig=new,
                 adjusted=adjusted,
                 evidence=evidence,
@@ -219,7 +219,7 @@ def triangulated(rig: Rig, rows: Sightings, scale_px: float) -> Float[np.ndarray
     return np.array([triangulate(rig, seen, scale_px)[0] for seen in rows.keypoints])
 
 
-def _in_world(adjusted: Adjusted, similarity: Similarity) -> Adjusted:
+def _in_world(adjusted: AdjustedByPeople, similarity: Similarity) -> AdjustedByPeople:
     state = adjusted.state
     cameras = len(state.rig)
     unit = np.ones((cameras, len(adjusted.information) // cameras))

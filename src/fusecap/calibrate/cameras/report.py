@@ -10,7 +10,7 @@ import numpy as np
 from fusecap.calibrate.cameras import extrinsics, extrinsics_checks
 from fusecap.calibrate.cameras.board import Board
 from fusecap.calibrate.cameras.board_views import CameraShots
-from fusecap.calibrate.cameras.extrinsics import Solution
+from fusecap.calibrate.cameras.extrinsics import RigSolution
 from fusecap.calibrate.cameras.extrinsics_checks import HeldOut, Repeatability, ScaleCheck
 from fusecap.calibrate.cameras.intrinsics import coverage_cells
 from fusecap.calibrate.verdict import Marks, Verdict
@@ -92,7 +92,7 @@ class RigReport:
 class RigCalibration:
     """Everything `calibrate extrinsics` has."""
 
-    solution: Solution
+    solution: RigSolution
     held_out: tuple[HeldOut, ...]
     report: RigReport
 
@@ -146,7 +146,7 @@ def calibrate_rig(
 
 
 def _report(
-    solution: Solution,
+    solution: RigSolution,
     found: Sequence[CameraShots],
     held_out: Sequence[HeldOut],
     scale: ScaleCheck,

@@ -64,7 +64,7 @@ class Residual:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Placement:
+class NewWorld:
     """A new world, and how sure it is."""
 
     change: Similarity
@@ -91,7 +91,7 @@ def from_board(
     thickness_m: float = 0.0,
     up_in_board: Float[np.ndarray, "3"] | None = None,
     scale: bool = False,
-) -> Placement:
+) -> NewWorld:
     """The world of a board that lies on the floor, face up.
 
     The origin is the outer corner of the board's first square, `thickness_m` below its face; x runs
@@ -137,7 +137,7 @@ def from_board(
             f"the board says that lengths of this calibration are to be multiplied by "
             f"{found_scale:.4f}; if board.toml has the measured square, use --scale-by board"
         )
-    return Placement(
+    return NewWorld(
         change=change,
         how=f"board on the floor, seen by {len(views)} of {len(rig)} cameras"
         + ("" if up_in_board is None else ", up from gravity"),
@@ -150,7 +150,7 @@ def from_board(
     )
 
 
-def from_points(rig: Rig, points: MarkedPoints, *, scale: bool = False) -> Placement:
+def from_points(rig: Rig, points: MarkedPoints, *, scale: bool = False) -> NewWorld:
     """The world in which marked points have their measured places, by least squares.
 
     Rigid, or with `scale` a similarity (Umeyama 1991). A point that contradicts the others is left
@@ -187,7 +187,7 @@ def from_points(rig: Rig, points: MarkedPoints, *, scale: bool = False) -> Place
         )
     if used.sum() == 3:
         problems.append("three points hardly check each other; mark a fourth")
-    return Placement(
+    return NewWorld(
         change=change,
         how=f"{used.sum()} marked points, {'similarity' if scale else 'rigid'}",
         residuals=_point_residuals(names, away_m, used, unseen),
@@ -199,7 +199,7 @@ def from_points(rig: Rig, points: MarkedPoints, *, scale: bool = False) -> Place
 
 def from_floor_points(
     rig: Rig, points: MarkedPoints, *, up_in_old: Float[np.ndarray, "3"] | None = None
-) -> Placement:
+) -> NewWorld:
     """The world whose floor is the plane through marked points, below the cameras.
 
     The axes turn no farther than the plane asks for and the origin moves along up only, so where x
@@ -235,7 +235,7 @@ def from_floor_points(
         problems.append(
             f"the floor's tilt is known to {tilt_deg:.2f} deg only; mark points farther apart"
         )
-    return Placement(
+    return NewWorld(
         change=Similarity(rotation=rotation, translation_m=np.array([0.0, -floor, 0.0])),
         how=f"{used.sum()} points on the floor",
         residuals=_point_residuals(names, away_m, used, unseen),
@@ -245,9 +245,9 @@ def from_floor_points(
     )
 
 
-def from_gravity(up_in_old: Float[np.ndarray, "3"]) -> Placement:
+def from_gravity(up_in_old: Float[np.ndarray, "3"]) -> NewWorld:
     """The world turned until `up_in_old` is y; its origin stays, so the floor is still unknown."""
-    return Placement(
+    return NewWorld(
         change=Similarity(rotation=least_turn(up_in_old, np.array([0.0, 1.0, 0.0]))),
         how="gravity",
         problems=(

@@ -69,7 +69,7 @@ _LEAST_RAD_S = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
-class Worn:
+class TimedSensor:
     """The samples of one sensor on its own clock."""
 
     bone: str
@@ -138,7 +138,7 @@ class _Signals:
         )
 
 
-def signals_of(sensors: Sequence[Worn], filmed: Filmed) -> _Signals | None:
+def signals_of(sensors: Sequence[TimedSensor], filmed: Filmed) -> _Signals | None:
     """Of the sensors whose bones move; None where none does."""
     at_s = np.arange(filmed.times_s[0], filmed.times_s[-1], STEP_S)
     start_s = min(float(worn.times_s[0]) for worn in sensors)
@@ -223,7 +223,7 @@ def turning_curves(signals: _Signals, max_offset_s: float) -> list[Curve]:
     ]
 
 
-def unknown_clock(sensors: Sequence[Worn], person: str) -> ImuClock:
+def unknown_clock(sensors: Sequence[TimedSensor], person: str) -> ImuClock:
     """Of sensors whose offset nothing tells."""
     return ImuClock(
         bones=tuple(worn.bone for worn in sensors),
@@ -242,7 +242,9 @@ def unknown_clock(sensors: Sequence[Worn], person: str) -> ImuClock:
 class Comparison:
     """Sensors against one person, for all offsets up to `max_offset_s`."""
 
-    def __init__(self, sensors: Sequence[Worn], filmed: Filmed, *, max_offset_s: float) -> None:
+    def __init__(
+        self, sensors: Sequence[TimedSensor], filmed: Filmed, *, max_offset_s: float
+    ) -> None:
         self.sensors, self.filmed = sensors, filmed
         self._signals = signals_of(sensors, filmed)
         self._curves: list[Curve] = []
@@ -274,7 +276,7 @@ class Comparison:
 
 
 def imu_clock(
-    sensors: Sequence[Worn],
+    sensors: Sequence[TimedSensor],
     filmed: Filmed,
     *,
     max_offset_s: float,

@@ -21,7 +21,7 @@ from fusecap.calibrate.sync.clock_rows import (
     judge,
 )
 from fusecap.calibrate.sync.curves import Curve
-from fusecap.calibrate.sync.imus import Comparison, Filmed, ImuClock, Worn, unknown_clock
+from fusecap.calibrate.sync.imus import Comparison, Filmed, ImuClock, TimedSensor, unknown_clock
 from fusecap.calibrate.sync.signals import MAX_GAP_S
 from fusecap.calibrate.sync.stamp import ERROR_S, Stamp, find_stamp
 from fusecap.calibrate.verdict import Verdict
@@ -114,7 +114,7 @@ def called_otherwise(
 def wearers(
     session: Session,
     worn: Sequence[SubjectSettings],
-    sensors: Sequence[Sequence[Worn]],
+    sensors: Sequence[Sequence[TimedSensor]],
     people: Sequence[Filmed],
     max_offset_s: float,
 ) -> list[Filmed | None]:
@@ -171,8 +171,8 @@ def _filmed(take: Take, index: int) -> Filmed:
     )
 
 
-def _worn(bone: str, track: ImuTrack) -> Worn:
-    return Worn(
+def _worn(bone: str, track: ImuTrack) -> TimedSensor:
+    return TimedSensor(
         bone=bone,
         times_s=track.times_s,
         rotation=from_wxyz(track.orientation_wxyz).as_matrix(),
@@ -182,7 +182,7 @@ def _worn(bone: str, track: ImuTrack) -> Worn:
 def subject_clocks(
     subject: SubjectSettings,
     tracks: Sequence[ImuTrack],
-    sensors: Sequence[Worn],
+    sensors: Sequence[TimedSensor],
     person: Filmed,
     max_offset_s: float,
     near_s: float | None,

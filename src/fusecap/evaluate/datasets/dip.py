@@ -22,7 +22,7 @@ from fusecap.body.landmarks import landmark_set_named
 from fusecap.body.shape import REFERENCE_HEIGHT_M, BodyShape
 from fusecap.body.skeleton import PAPER21
 from fusecap.errors import InputError
-from fusecap.evaluate.datasets.recording import BoneTruth, Recording
+from fusecap.evaluate.datasets.recording import BoneTruth, DatasetSequence
 from fusecap.evaluate.datasets.safe_pickle import load_pickle
 from fusecap.geometry.camera import Rig
 from fusecap.solve.estimator import SubjectModel
@@ -77,7 +77,7 @@ SMPL_BONES = {
 """Our bone and the SMPL joint that turns it."""
 
 
-def load_dip(path: Path | str, *, height_m: float = REFERENCE_HEIGHT_M) -> Recording:
+def load_dip(path: Path | str, *, height_m: float = REFERENCE_HEIGHT_M) -> DatasetSequence:
     """One sequence, without cameras; raises `InputError`."""
     path = Path(path)
     data = load_pickle(path)
@@ -102,7 +102,7 @@ def load_dip(path: Path | str, *, height_m: float = REFERENCE_HEIGHT_M) -> Recor
         position_m=np.zeros((len(worn), 3)),
     )
     name = path.stem
-    return Recording(
+    return DatasetSequence(
         name=name,
         rate_hz=RATE_HZ,
         frames=frames,

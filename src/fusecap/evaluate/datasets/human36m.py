@@ -26,7 +26,12 @@ import numpy as np
 from fusecap.body.landmarks import LandmarkSet, landmark_set_named
 from fusecap.errors import InputError, nearest
 from fusecap.evaluate.datasets.files import camera_at_centre
-from fusecap.evaluate.datasets.recording import LandmarkTruth, Recording, last_frame, read_views
+from fusecap.evaluate.datasets.recording import (
+    DatasetSequence,
+    LandmarkTruth,
+    last_frame,
+    read_views,
+)
 from fusecap.evaluate.datasets.safe_pickle import load_npz_object
 from fusecap.geometry.camera import Y_UP_FROM_Z_UP, Rig
 from fusecap.sources.calibration_files import fields
@@ -82,7 +87,7 @@ def list_takes(folder: Path | str, subjects: Sequence[str] = SUBJECTS) -> tuple[
 
 def load_take36(
     folder: Path | str, take: Take36, cameras: Sequence[str] | None = None
-) -> Recording:
+) -> DatasetSequence:
     """One take as seen by the cameras with these ids, all by default; raises `InputError`."""
     folder = Path(folder)
     rig = read_rig(folder / "cameras.json", take.subject)
@@ -91,7 +96,7 @@ def load_take36(
     seen = folder / "keypoints" / take.subject / take.action
     views = read_views({name: seen / name for name in rig.names}, landmarks, RATE_HZ)
     points = _Positions(folder).points(take)
-    return Recording(
+    return DatasetSequence(
         name=f"{take.subject} {take.action}",
         rate_hz=RATE_HZ,
         frames=min(last_frame(views), len(points)),

@@ -18,7 +18,12 @@ import numpy as np
 
 from fusecap.body.landmarks import LandmarkSet, landmark_set_named
 from fusecap.errors import InputError
-from fusecap.evaluate.datasets.recording import LandmarkTruth, Recording, last_frame, read_views
+from fusecap.evaluate.datasets.recording import (
+    DatasetSequence,
+    LandmarkTruth,
+    last_frame,
+    read_views,
+)
 from fusecap.geometry.camera import Rig
 from fusecap.sources.calibration_files import load_rig
 from fusecap.sources.calibration_files.loader import Y_UP_FROM
@@ -34,7 +39,7 @@ COCO19 = LandmarkSet(name="coco19", landmark_names=tuple(_NAMES.split()))
 _POSES = "hdPose3d_stage1_coco19"
 
 
-def load_panoptic(folder: Path | str) -> Recording:
+def load_panoptic(folder: Path | str) -> DatasetSequence:
     """The sequence in a folder; raises `InputError`."""
     folder = Path(folder)
     root = folder / "keypoints"
@@ -48,7 +53,7 @@ def load_panoptic(folder: Path | str) -> Recording:
     landmarks = landmark_set_named("body25")
     views = read_views({name: root / name for name in names}, landmarks, RATE_HZ)
     truth = read_poses(folder)
-    return Recording(
+    return DatasetSequence(
         name=folder.name,
         rate_hz=RATE_HZ,
         frames=last_frame(views),

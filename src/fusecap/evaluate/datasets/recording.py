@@ -100,7 +100,7 @@ Truth = LandmarkTruth | BoneTruth
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Recording:
+class DatasetSequence:
     """One sequence of a data set; `Instants` for the solver."""
 
     name: str

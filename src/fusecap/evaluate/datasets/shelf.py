@@ -34,7 +34,7 @@ from jaxtyping import Float, Int
 from fusecap.body.landmarks import LANDMARKS, landmark_set_named
 from fusecap.errors import InputError
 from fusecap.evaluate.datasets.files import camera_at_centre, unpacked
-from fusecap.evaluate.datasets.recording import Recording, last_frame, read_views
+from fusecap.evaluate.datasets.recording import DatasetSequence, last_frame, read_views
 from fusecap.evaluate.metrics import correct_limbs, identity_switches, match_people
 from fusecap.evaluate.tables import Table
 from fusecap.geometry.camera import Y_UP_FROM_Z_UP, Rig
@@ -101,7 +101,7 @@ class ShelfScore:
     identity_switches: int
 
 
-def load_shelf(folder: Path | str) -> Recording:
+def load_shelf(folder: Path | str) -> DatasetSequence:
     """The sequence in a folder; raises `InputError`. Its truth is `load_shelf_truth`."""
     folder = Path(folder)
     rig = read_rig(folder)
@@ -110,7 +110,7 @@ def load_shelf(folder: Path | str) -> Recording:
     loose = all((folder / name).is_dir() for name in rig.names)
     with nullcontext(folder) if loose or not packed.is_file() else unpacked(packed) as root:
         views = read_views({name: root / name for name in rig.names}, landmarks, RATE_HZ)
-    return Recording(
+    return DatasetSequence(
         name="campus" if len(rig) == 3 else "shelf",
         rate_hz=RATE_HZ,
         frames=last_frame(views),

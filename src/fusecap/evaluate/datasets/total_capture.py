@@ -38,7 +38,7 @@ from fusecap.body.shape import REFERENCE_HEIGHT_M, BodyShape
 from fusecap.body.skeleton import PAPER21, Skeleton
 from fusecap.errors import InputError
 from fusecap.evaluate.datasets.files import floats, read_text
-from fusecap.evaluate.datasets.recording import BoneTruth, Recording, last_frame, read_views
+from fusecap.evaluate.datasets.recording import BoneTruth, DatasetSequence, last_frame, read_views
 from fusecap.geometry.camera import Camera, Rig
 from fusecap.geometry.quaternions import from_wxyz
 from fusecap.solve.estimator import SubjectModel
@@ -160,7 +160,7 @@ def load_sequence(
     skeleton: Skeleton = PAPER21,
     landmarks: LandmarkSet | None = None,
     height_m: float | None = None,
-) -> Recording:
+) -> DatasetSequence:
     """One sequence; raises `InputError`.
 
     Bone lengths are the truth's, as in the paper, or with `height_m` those of a stature.
@@ -197,7 +197,7 @@ def load_sequence(
         bone=tuple(skeleton.bone(bone) for bone in SENSORS.values()),
         position_m=np.zeros((len(SENSORS), 3)),
     )
-    return Recording(
+    return DatasetSequence(
         name=sequence.key,
         rate_hz=RATE_HZ,
         frames=frames,

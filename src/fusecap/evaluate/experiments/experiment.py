@@ -61,7 +61,7 @@ def settings(
 
 
 @dataclass(frozen=True, kw_only=True)
-class Finding:
+class Claim:
     """Something the paper found, and whether the twin shows it."""
 
     statement: str
@@ -77,7 +77,7 @@ class Report:
     """What an experiment says."""
 
     tables: tuple[Table, ...]
-    findings: tuple[Finding, ...] = ()
+    findings: tuple[Claim, ...] = ()
     plots: Mapping[str, Figure] = field(default_factory=dict)
     """By the end of their file names."""
 

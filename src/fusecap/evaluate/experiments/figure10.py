@@ -6,8 +6,8 @@ from matplotlib.figure import Figure
 
 from fusecap.evaluate.cells import TwinCell
 from fusecap.evaluate.experiments.experiment import (
+    Claim,
     Experiment,
-    Finding,
     Report,
     Results,
     Settings,
@@ -65,13 +65,13 @@ def report(settings: Settings, results: Results) -> Report:
             ),
         ),
         findings=(
-            Finding(
+            Claim(
                 statement="With one camera the floor term keeps the feet from going through the "
                 "floor (mean depth at most a third)",
                 evidence=f"{with_floor[deep]:.2f} mm with it, {without[deep]:.2f} mm without",
                 holds=below(with_floor[deep], without[deep], 1 / 3),
             ),
-            Finding(
+            Claim(
                 statement="It hardly changes the position error (less than 5 %)",
                 evidence=f"{with_floor[place]:.1f} mm with it, {without[place]:.1f} mm without",
                 holds=both(below(abs(with_floor[place] / without[place] - 1), 0.05)),

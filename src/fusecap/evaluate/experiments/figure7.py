@@ -6,8 +6,8 @@ from matplotlib.figure import Figure
 
 from fusecap.evaluate.cells import TwinCell
 from fusecap.evaluate.experiments.experiment import (
+    Claim,
     Experiment,
-    Finding,
     Report,
     Results,
     Settings,
@@ -87,7 +87,7 @@ def _shown(spread: Spread | None) -> str | None:
     return with_spread(spread.mean, spread.std) if spread else None
 
 
-def _findings(errors: Errors) -> tuple[Finding, ...]:
+def _findings(errors: Errors) -> tuple[Claim, ...]:
     def mean(count: int, imus: int, metric: str) -> float:
         return errors[count, imus, metric].mean
 
@@ -114,7 +114,7 @@ def _findings(errors: Errors) -> tuple[Finding, ...]:
         ),
     )
     return (
-        Finding(
+        Claim(
             statement="Fusion beats either modality: 8 cameras with 13 IMUs against 8 cameras "
             "alone (position, orientation) and 13 IMUs alone (aligned position, orientation)",
             evidence=f"{mean(8, 13, place):.1f} mm and {mean(8, 13, turn):.1f} deg fused; "
@@ -123,7 +123,7 @@ def _findings(errors: Errors) -> tuple[Finding, ...]:
             f"{mean(0, 13, turn):.1f} deg from IMUs",
             holds=fused,
         ),
-        Finding(
+        Claim(
             statement="Fusion beats video with 1 and with 3 cameras (position, orientation)",
             evidence=", ".join(
                 f"{count} camera{'s' * (count > 1)}: {mean(count, 13, place):.1f} mm, "
@@ -133,14 +133,14 @@ def _findings(errors: Errors) -> tuple[Finding, ...]:
             ),
             holds=sparse,
         ),
-        Finding(
+        Claim(
             statement="Three cameras are enough for global position (13 IMUs: within 1.5 times "
             "the error of eight, and from 3 to 8 less than a quarter of the gain from 1 to 3)",
             evidence=f"1 camera {mean(1, 13, place):.1f} mm, 3 cameras {mean(3, 13, place):.1f} "
             f"mm, 8 cameras {mean(8, 13, place):.1f} mm",
             holds=three,
         ),
-        Finding(
+        Claim(
             statement="6 IMUs reduce the orientation error, and 13 reduce it further (3 and 8 "
             "cameras)",
             evidence=", ".join(

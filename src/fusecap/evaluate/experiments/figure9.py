@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 
 from fusecap.evaluate.cells import TwinCell
 from fusecap.evaluate.experiments.experiment import (
+    Claim,
     Experiment,
-    Finding,
     Report,
     Results,
     Settings,
@@ -71,7 +71,7 @@ def report(settings: Settings, results: Results) -> Report:
     return Report(
         tables=tables,
         findings=(
-            Finding(
+            Claim(
                 statement="Ten times the weight (1e-2 for 1e-3) lowers the acceleration error and "
                 "raises the position and velocity errors",
                 evidence=f"joints: acceleration {low[2]:.2f} to {high[2]:.2f} m/s², position "
@@ -81,7 +81,7 @@ def report(settings: Settings, results: Results) -> Report:
                 why="At 1e-2 the solve loses the person. The trade-off that the paper describes is "
                 "that from 1e-4 to 1e-3 here: less acceleration error, more position error.",
             ),
-            Finding(
+            Claim(
                 statement="The acceleration term does not help: 1e-3 errs more than 0",
                 evidence=f"{low[0]:.1f} mm, {low[1]:.1f} deg against {off[0]:.1f} mm, "
                 f"{off[1]:.1f} deg",
@@ -93,9 +93,9 @@ def report(settings: Settings, results: Results) -> Report:
     )
 
 
-def _harmless(errors: dict[tuple[int, float], list[float]]) -> Finding:
+def _harmless(errors: dict[tuple[int, float], list[float]]) -> Claim:
     one, off = errors[1, 1e-3], errors[1, 0.0]
-    return Finding(
+    return Claim(
         statement="With one camera the printed weight of 1e-3 is as harmless as with eight (the "
         "paper's table 2 was made with it)",
         evidence=f"1 camera: {one[0]:.0f} mm at 1e-3, {off[0]:.0f} mm at 0",

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 
 from fusecap.evaluate.cells import TwinCell
 from fusecap.evaluate.experiments.experiment import (
+    Claim,
     Experiment,
-    Finding,
     Report,
     Results,
     Settings,
@@ -107,7 +107,7 @@ def _sum(results: Results, cells: list[TwinCell], key: str) -> int | None:
     return int(total) if total == total else None
 
 
-def _findings(settings: Settings, results: Results) -> tuple[Finding, ...]:
+def _findings(settings: Settings, results: Results) -> tuple[Claim, ...]:
     every = {
         sorter: [
             cell
@@ -123,18 +123,18 @@ def _findings(settings: Settings, results: Results) -> tuple[Finding, ...]:
     swaps = _sum(results, close["paper"], "identity_switches")
     error_mm = {s: results.spread(close[s], "score", "position_error_mm").mean for s in SORTERS}
     return (
-        Finding(
+        Claim(
             statement="The tracker neither swaps, misses nor invents anybody",
             evidence="switches, missed, false: " + " / ".join(map(str, faults["tracker"])),
             holds=None if None in faults["tracker"] else not any(faults["tracker"]),
         ),
-        Finding(
+        Claim(
             statement="The tracker keeps identities better than Algorithm 1 (IDF1)",
             evidence=f"{idf1['tracker']:.3f} against {idf1['paper']:.3f}; Algorithm 1's switches, "
             "missed, false: " + " / ".join(map(str, faults["paper"])),
             holds=both(below(idf1["paper"], idf1["tracker"])),
         ),
-        Finding(
+        Claim(
             statement="Algorithm 1 swaps subjects in close interaction",
             evidence=f"{swaps} switches in scene 'close', but {error_mm['paper']:.0f} mm where the "
             f"tracker has {error_mm['tracker']:.0f} mm",

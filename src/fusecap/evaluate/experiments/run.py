@@ -12,8 +12,8 @@ from typing import Any
 from fusecap.evaluate.cells import solve_cell
 from fusecap.evaluate.code_version import code_version
 from fusecap.evaluate.experiments.experiment import (
+    Claim,
     Experiment,
-    Finding,
     Report,
     Results,
     Settings,
@@ -55,7 +55,7 @@ class Evaluation:
         return [outcome for outcome in self.outcomes if outcome.result is None]
 
     @property
-    def findings(self) -> list[Finding]:
+    def findings(self) -> list[Claim]:
         """Bad news first."""
         return sorted(self.report.findings, key=lambda f: (False, None, True).index(f.holds))
 

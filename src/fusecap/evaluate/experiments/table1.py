@@ -9,8 +9,8 @@ import numpy as np
 from fusecap.evaluate.cells import TwinCell
 from fusecap.evaluate.experiments.experiment import (
     WEIGHTS,
+    Claim,
     Experiment,
-    Finding,
     Report,
     Results,
     Settings,
@@ -72,7 +72,7 @@ def report(settings: Settings, results: Results) -> Report:
     return Report(
         tables=(*tables, _per_bone(settings, results), _motion(settings, results)),
         findings=(
-            Finding(
+            Claim(
                 statement="With the paper's weights the twin errs as the paper says: 26.1 mm, "
                 "7.5 deg (within 15 %)",
                 evidence=f"{paper.mean:.1f} mm, {turned.mean:.1f} deg ({mean(inner):.1f} deg "
@@ -81,7 +81,7 @@ def report(settings: Settings, results: Results) -> Report:
                 why="No sensor tells how hands and toes are turned, and the motion here turns "
                 "them freely.",
             ),
-            Finding(
+            Claim(
                 statement="The default weights err less than the paper's (here, not in the paper)",
                 evidence=f"{default.mean:.1f} mm against {paper.mean:.1f} mm",
                 holds=below(default.mean, paper.mean),

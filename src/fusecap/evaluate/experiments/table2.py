@@ -5,8 +5,8 @@ from __future__ import annotations
 from fusecap.evaluate.cells import TwinCell
 from fusecap.evaluate.experiments.experiment import (
     WEIGHTS,
+    Claim,
     Experiment,
-    Finding,
     Report,
     Results,
     Settings,
@@ -60,7 +60,7 @@ def report(settings: Settings, results: Results) -> Report:
             )
         )
         findings.append(
-            Finding(
+            Claim(
                 statement=f"{name}: no more than 1.25 times the paper's errors, {paper_mm} mm and "
                 f"{paper_deg} deg",
                 evidence=f"{place.mean:.1f} mm, {turn.mean:.1f} deg",

@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 
 from fusecap.evaluate.cells import TwinCell, mean_offsets
 from fusecap.evaluate.experiments.experiment import (
+    Claim,
     Experiment,
-    Finding,
     Report,
     Results,
     Settings,
@@ -131,7 +131,7 @@ def _relative(value: float, full: float) -> str | None:
     return f"{value:.1f} ({value / full:.2f})" if math.isfinite(value + full) else None
 
 
-def _sparse(settings: Settings, results: Results) -> tuple[Table, tuple[Finding, ...]]:
+def _sparse(settings: Settings, results: Results) -> tuple[Table, tuple[Claim, ...]]:
     rows: list[tuple[Value, ...]] = []
     ratios = {}
     for cameras, imus in SPARSE:
@@ -160,10 +160,10 @@ def _sparse(settings: Settings, results: Results) -> tuple[Table, tuple[Finding,
     return table, tuple(_halved(name, ratios[name]) for name in SPARSE_FINDINGS)
 
 
-def _halved(name: str, ratio: tuple[float, float]) -> Finding:
+def _halved(name: str, ratio: tuple[float, float]) -> Claim:
     factor, why = SPARSE_FINDINGS[name]
     claim = "more than halves the errors" if factor == 2.0 else "reduces the errors"
-    return Finding(
+    return Claim(
         statement=f"The prior {claim} with {name}",
         evidence=f"without it {ratio[0]:.2f} times the aligned position error, {ratio[1]:.2f} "
         "times the orientation error",
@@ -172,7 +172,7 @@ def _halved(name: str, ratio: tuple[float, float]) -> Finding:
     )
 
 
-def _findings(spreads: dict[str, dict[str, Spread]]) -> tuple[Finding, ...]:
+def _findings(spreads: dict[str, dict[str, Spread]]) -> tuple[Claim, ...]:
     place, turn = "position_error_mm", "orientation_error_deg"
 
     def compared(name: str, against: str = "full") -> str:
@@ -197,7 +197,7 @@ def _findings(spreads: dict[str, dict[str, Spread]]) -> tuple[Finding, ...]:
         "E_PD off (prior deviation)",
     )
     return (
-        Finding(
+        Claim(
             statement="The prior projection more than halves both errors with 8 cameras and 13 "
             "IMUs",
             evidence=compared(prior),
@@ -207,32 +207,32 @@ def _findings(spreads: dict[str, dict[str, Spread]]) -> tuple[Finding, ...]:
             f"run away where E_PD is left alone (with both off: {spreads[neither][turn].mean:.1f} "
             "deg).",
         ),
-        Finding(
+        Claim(
             statement="The prior deviation improves both errors (the paper: a little)",
             evidence=compared(deviation),
             holds=both(helps(deviation, place), helps(deviation, turn)),
         ),
-        Finding(
+        Claim(
             statement="The orientation term reduces orientation and position errors",
             evidence=compared(imu),
             holds=both(helps(imu, place), helps(imu, turn)),
         ),
-        Finding(
+        Claim(
             statement="The acceleration term does not help the frame-by-frame solve",
             evidence=compared(lag),
             holds=both(helps(lag, place), helps(lag, turn)),
         ),
-        Finding(
+        Claim(
             statement="Without the position term the global position is lost",
             evidence=compared("E_P off (position)"),
             holds=below(10.0, ratio("E_P off (position)", place)),
         ),
-        Finding(
+        Claim(
             statement="The floor term changes the figures little (less than 5 %)",
             evidence=compared(floor),
             holds=both(*[below(abs(ratio(floor, m) - 1), 0.05) for m in (place, turn)]),
         ),
-        Finding(
+        Claim(
             statement="Calibrated offsets reduce the position error, with 25 and with 12 keypoints",
             evidence=compared(calibrated) + "; " + compared(f"{k12}, calibrated offsets", k12),
             holds=both(
@@ -240,7 +240,7 @@ def _findings(spreads: dict[str, dict[str, Spread]]) -> tuple[Finding, ...]:
                 below(spreads[f"{k12}, calibrated offsets"][place].mean, spreads[k12][place].mean),
             ),
         ),
-        Finding(
+        Claim(
             statement="25 keypoints are better than 12, both with calibrated offsets",
             evidence=compared(calibrated, f"{k12}, calibrated offsets"),
             holds=below(

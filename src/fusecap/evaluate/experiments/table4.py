@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from fusecap.evaluate.cells import TwinCell
 from fusecap.evaluate.experiments.experiment import (
+    Claim,
     Experiment,
-    Finding,
     Report,
     Results,
     Settings,
@@ -69,12 +69,12 @@ def report(settings: Settings, results: Results) -> Report:
             ),
         ),
         findings=(
-            Finding(
+            Claim(
                 statement="Four cameras do better globally than one does after alignment",
                 evidence=f"{mean[0]:.1f} mm against {mean[1]:.1f} mm",
                 holds=below(mean[0], mean[1]),
             ),
-            Finding(
+            Claim(
                 statement="The floor term matters little for the error of one camera (the paper: "
                 "about 2 %)",
                 evidence=f"{mean[1]:.1f} mm with it, {mean[2]:.1f} mm without",

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from fusecap.evaluate.cells import TwinCell
 from fusecap.evaluate.experiments.experiment import (
+    Claim,
     Experiment,
-    Finding,
     Report,
     Results,
     Settings,
@@ -50,12 +50,12 @@ def report(settings: Settings, results: Results) -> Report:
     )
 
 
-def _finding(settings: Settings, results: Results, cameras: int, imus: int) -> Finding:
+def _finding(settings: Settings, results: Results, cameras: int, imus: int) -> Claim:
     printed, ours = (
         [results.spread(_row(settings, cameras, imus, w), "score", m).mean for m in _METRICS]
         for w in (1.0, DEFAULT)
     )
-    return Finding(
+    return Claim(
         statement=f"{_named(cameras, imus)}: a weight of {DEFAULT:g} errs less than the printed 1",
         evidence=f"aligned {ours[0]:.1f} mm, {ours[1]:.1f} deg against {printed[0]:.1f} mm, "
         f"{printed[1]:.1f} deg",

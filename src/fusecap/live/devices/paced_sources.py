@@ -174,7 +174,7 @@ class HeldPictures(_Stored):
         return CameraImage(camera=self._camera, timestamp_ns=stamp_ns, image=self._images[row])
 
 
-class Pictures(PacedSource):
+class PacedPictures(PacedSource):
     """A camera whose pictures are decoded one ahead of their time, each round anew."""
 
     def __init__(
@@ -217,7 +217,7 @@ class Pictures(PacedSource):
         return True
 
 
-class Sensors(_Stored):
+class PacedSensors(_Stored):
     """All sensors of one subject, their samples merged in the order of their times."""
 
     def __init__(

@@ -18,10 +18,10 @@ from fusecap.errors import InputError, SessionError
 from fusecap.live.devices.paced_sources import (
     HeldPictures,
     Keypoints,
+    PacedPictures,
+    PacedSensors,
     PacedSource,
-    Pictures,
     Schedule,
-    Sensors,
 )
 from fusecap.live.devices.source import Deliver, Delivery, SessionClock, Source
 from fusecap.progress import Progress
@@ -190,7 +190,7 @@ def _cameras(
                     "decode it before the run (in_memory)"
                 )
             else:
-                yield Pictures(index, camera.name, video, times_s, shown)
+                yield PacedPictures(index, camera.name, video, times_s, shown)
         else:
             raise SessionError(
                 f"{session.path}: camera '{camera.name}' is live only; name a folder of keypoints "
@@ -208,7 +208,7 @@ def _sensors(session: Session) -> Iterator[PacedSource]:
                 clocks.imu(subject.name, bone).session_s(track.times_s)
                 for bone, track in zip(bones, tracks, strict=True)
             ]
-            yield Sensors(subject.name, bones, tracks, times_s)
+            yield PacedSensors(subject.name, bones, tracks, times_s)
 
 
 def _exposed_s(video: Video, camera: CameraSettings) -> Float[np.ndarray, " f"]:

@@ -12,7 +12,7 @@ from fusecap.errors import InputError, nearest
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Table:
+class ImuTable:
     """Columns by name, and the lines that came before their header."""
 
     path: Path
@@ -47,7 +47,7 @@ def read_lines(path: Path) -> list[str]:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
 
 
-def read_table(path: Path, first_column: str, *, units_line: bool = False) -> Table:
+def read_table(path: Path, first_column: str, *, units_line: bool = False) -> ImuTable:
     """The table whose header line starts with `first_column`; tabs, commas or semicolons.
 
     Raises `InputError` when there is no such header or no row under it.
@@ -66,7 +66,7 @@ def read_table(path: Path, first_column: str, *, units_line: bool = False) -> Ta
     rows = [_numbers(line.split(delimiter), len(columns)) for line in body if line.strip()]
     if not rows:
         raise InputError(f"{path}: no samples below the header; export the recording again")
-    return Table(path=path, preamble=tuple(lines[:index]), columns=columns, rows=np.array(rows))
+    return ImuTable(path=path, preamble=tuple(lines[:index]), columns=columns, rows=np.array(rows))
 
 
 def _numbers(cells: list[str], count: int) -> list[float]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from fusecap.sources.imu_files.loader import ImuFormat
-from fusecap.sources.imu_files.table import Table, chosen, read_table
+from fusecap.sources.imu_files.table import ImuTable, chosen, read_table
 from fusecap.sources.imu_files.track import ImuTrack, tidy
 
 _SCALAR = "/Orientation/Scalar"
@@ -33,7 +33,7 @@ def sensors(path: Path) -> tuple[str, ...]:
     return _names(read_table(path, "Time", units_line=True))
 
 
-def _names(table: Table) -> tuple[str, ...]:
+def _names(table: ImuTable) -> tuple[str, ...]:
     return tuple(c.removesuffix(_SCALAR) for c in table.columns if c.endswith(_SCALAR))
 
 

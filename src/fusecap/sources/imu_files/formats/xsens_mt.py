@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from fusecap.errors import InputError
 from fusecap.geometry.quaternions import to_wxyz
 from fusecap.sources.imu_files.loader import ImuFormat
-from fusecap.sources.imu_files.table import Table, read_table
+from fusecap.sources.imu_files.table import ImuTable, read_table
 from fusecap.sources.imu_files.track import ImuTrack, SharedClock, tidy, unwrapped
 
 PACKET_MODULUS = 65536
@@ -49,7 +49,7 @@ def read(path: Path, _sensor: str | None, rate_hz: float | None) -> ImuTrack:
     )
 
 
-def _rate_hz(table: Table, stated_hz: float | None) -> float:
+def _rate_hz(table: ImuTable, stated_hz: float | None) -> float:
     for line in table.preamble:
         match = _RATE.search(line)
         if match and float(match.group(1)) > 0:
@@ -61,7 +61,7 @@ def _rate_hz(table: Table, stated_hz: float | None) -> float:
     return stated_hz
 
 
-def _orientation_wxyz(table: Table) -> np.ndarray:
+def _orientation_wxyz(table: ImuTable) -> np.ndarray:
     if table.has(_QUATERNION):
         return table.take(_QUATERNION)
     if table.has(_MATRIX):
