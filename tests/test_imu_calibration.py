@@ -39,7 +39,7 @@ from fusecap.sources.imu_calibration_files import (
     imu_calibration_toml,
     read_imu_calibration,
 )
-from fusecap.sources.imu_files.track import GRAVITY_M_S2, ImuTrack
+from fusecap.sources.imu_files.track import ImuTrack
 from fusecap.sources.session import ImuSettings, SubjectSettings
 from fusecap.sources.session_file import load_session
 from fusecap.take import take_from_theta
