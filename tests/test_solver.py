@@ -178,12 +178,47 @@ def test_garbage_in_never_gives_a_nan_out(garbage, rng):
         assert np.isfinite(result.bone_quality).all()
 
 
-def test_a_solve_that_cannot_improve_reports_divergence_and_keeps_the_pose():
+@pytest.mark.parametrize(("place", "value"), [(slice(None), np.nan), (1, -1e200)])
+def test_a_solve_that_cannot_improve_reports_divergence_and_keeps_the_pose(place, value):
     rig, truth = ring(4), standing()
     data, _ = measure(truth, SHAPE, rig)
     solver = PoseSolver(shape=SHAPE, rig=rig, landmarks=LANDMARKS, prior=flat_prior())
-    bad = np.full(PAPER21.pose_size, np.nan)
-    assert solver.solve(bad, data).status is Status.DIVERGED
+    bad = standing(0.3, 0.2, 0.6)
+    bad[place] = value
+    solution = solver.solve(bad, data)
+    assert solution.status is Status.DIVERGED
+    np.testing.assert_allclose(solution.theta, bad, rtol=1e-12, atol=1e-12)
+
+
+def test_far_starts_never_end_above_their_cost_and_reach_what_near_starts_reach(rng):
+    rig, truth = ring(4), standing()
+    data, _ = measure(truth, SHAPE, rig)
+    solver = PoseSolver(
+        shape=SHAPE, rig=rig, landmarks=LANDMARKS, prior=load_prior(PAPER21),
+        options=replace(WEAK_PRIOR, function_tolerance=1e-9, max_iterations=200),
+    )  # fmt: skip
+    near = solver.solve(truth + 0.02, data).cost
+    for start in truth + rng.normal(scale=0.2, size=(20, truth.size)):
+        at_start, _, _ = solver.evaluate(start, data)
+        far = solver.solve(start, data).cost
+        assert far <= at_start
+        # Bones that the keypoints leave free may keep the far start's turn, at the prior's cost.
+        assert far == pytest.approx(near, abs=0.2)
+
+
+def test_a_body_under_constant_acceleration_is_followed_with_the_acceleration_term():
+    rig, accel, dt_s = ring(4), np.array([3.0, 0.0, -2.0]), 1 / 60
+    _, sites = measure(standing(), SHAPE, rig, imu_bones=IMU13)
+    options = SolverOptions(weights=replace(WEAK_PRIOR.weights, acceleration=1e-3))
+    est = estimator(rig=rig, sites=sites, options=options)
+    for frame in range(20):
+        t = (frame - 15) * dt_s
+        truth = standing()
+        truth[:3] += 0.5 * accel * t * t
+        seen, _ = observe(truth, rig, round(frame * dt_s * 1e9), IMU13)
+        felt = replace(seen.imu, accel_in_world_m_s2=np.tile(accel, (len(IMU13), 1)))
+        result = est.update(replace(seen, imu=felt), points_of(truth) if frame == 0 else None)
+        assert pose_error_mm_deg(SHAPE, truth, result.theta)[0] < 10
 
 
 def test_iteration_limit_is_reported():
