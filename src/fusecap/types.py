@@ -1,11 +1,11 @@
 """What crosses a stage.
 
-    sources ──Detections, ImuReading──▶ associate ──Observation──▶ solve ──Estimate──▶ sinks
+    sources ──Detections, ImuReading──▶ associate ──Observation──▶ solve ──Estimate──▶ take, streams
 
 Live, samples come one by one, each with a time of its own:
 
     CameraImage ──detect──▶ CameraSample ┐
-                               ImuSample ├──▶ Event ──online──▶ Detections, ImuReading
+                               ImuSample ├──▶ Event ──engine──▶ Detections, ImuReading
                            Command, Tick ┘
 
 Arrays are float64, shapes are types, missing values are NaN with confidence 0. Times are int

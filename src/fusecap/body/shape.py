@@ -1,7 +1,7 @@
 """Body shape: where each joint sits in its parent's frame.
 
 Three ways to one: measured bone lengths, a stature scaled by published proportions, or (in
-`fusecap.solve.shape`) estimated from the take itself.
+`fusecap.solve.body_measure`) estimated from the take itself.
 
 The proportions are fractions of stature. Limb segments follow Drillis and Contini (1966) as
 reprinted by Winter, "Biomechanics and Motor Control of Human Movement", fig. 4.1: upper arm
