@@ -18,7 +18,6 @@ from fusecap.body.landmarks import LandmarkSet
 from fusecap.body.prior import PosePrior
 from fusecap.body.shape import BodyShape
 from fusecap.geometry.camera import Rig
-from fusecap.kernels.groups import TermWeights
 from fusecap.solve.options import SolverOptions
 from fusecap.solve.pose_solver import ImuSites, Measurements
 
@@ -51,6 +50,9 @@ _FRAME: dict[str, tuple[str | int, ...]] = {
     "imu_accel": ("imus", 3),
     "imu_history": (2, "imus", 3),
 }
+
+TERMS = ("position", "orientation", "acceleration", "projection", "deviation", "floor")
+"""Of one instant, in the order of the peers' files."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +114,7 @@ def build_problems(
         "prior_sigma": prior.sigma,
         "floor_bone": np.array([skeleton.bone(name) for name in floor_bones]),
         "floor_radius_m": np.array([options.floor_radius_m]),
-        "weights": [getattr(options.weights, name) for name in TermWeights._fields],
+        "weights": [getattr(options.weights, name) for name in TERMS],
         "function_tolerance": np.array([options.function_tolerance]),
         "max_iterations": np.array([options.max_iterations]),
     }

@@ -32,3 +32,8 @@ class Findings(list[Finding]):
     def add(self, severity: Severity, where: str, found: str, remedy: str = "") -> None:
         """One more."""
         self.append(Finding(severity=severity, where=where, found=found, remedy=remedy))
+
+    def sorted(self) -> list[Finding]:
+        """Errors first, then warnings."""
+        order: dict[Severity, int] = {"error": 0, "warning": 1, "info": 2}
+        return sorted(self, key=lambda finding: order[finding.severity])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,20 +12,17 @@ from fusecap.doctor.imus import check_imus
 from fusecap.doctor.keypoints import check_keypoints
 from fusecap.doctor.views import check_views
 from fusecap.errors import FusecapError
-from fusecap.findings import Finding, Findings, Severity
-from fusecap.geometry.camera import Rig
+from fusecap.findings import Finding, Findings
 from fusecap.progress import Progress
 from fusecap.sources.keypoint_files import KeypointTrack
 from fusecap.sources.session import FILE_NAME, Session
-from fusecap.sources.session_cameras import open_rig, with_detections
-from fusecap.sources.session_data import session_clocks, solve_times_s, unplaced_wearers
+from fusecap.sources.session_cameras import with_detections
+from fusecap.sources.session_data import open_inputs
 from fusecap.sources.session_file import (
     missing_files,
     parse_session,
-    session_file,
     with_imu_calibration,
 )
-from fusecap.sources.sync_files import Clocks
 
 SHORT_S = 0.5
 """A person is followed for about as long before becoming a subject."""
@@ -37,7 +33,7 @@ def diagnose(path: Path | str, progress: Progress | None = None) -> list[Finding
     findings = Findings()
     if Path(path).is_dir() and not (Path(path) / FILE_NAME).is_file():
         check_folder(Path(path), findings)
-        return _sorted(findings)
+        return findings.sorted()
     try:
         session = with_detections(parse_session(path))
     except FusecapError as error:
@@ -46,73 +42,68 @@ def diagnose(path: Path | str, progress: Progress | None = None) -> list[Finding
         return findings
     for line in missing_files(session):
         findings.add("error", *_split(line))
-    session, clocks = _calibrated(session, findings)
-    rig = _check_rig(session, findings)
+    session = _calibrated(session, findings)
+    told = _told(session)
+
+    def failed(where: str, error: FusecapError) -> None:
+        if where in told:
+            return
+        if where == "calibration" and session.settings.calibration is None:
+            findings.add("error", where, "is missing under [session]", PRINT_A_BOARD)
+            return
+        found = str(error).removeprefix(f"{session.path}: ").removeprefix(f"{where}: ")
+        remedy = "fusecap calibrate sync writes it anew" if where == "clocks" else ""
+        findings.add("error", where, found, remedy)
+
+    inputs = open_inputs(session, failed, progress)
+    findings += inputs.findings
     check_detection(session, findings)
-    tracks = check_keypoints(session, rig, findings, progress)
-    tracks = {
-        name: replace(track, times_s=clocks.camera(name).session_s(track.times_s))
-        for name, track in tracks.items()
-    }
-    imus = check_imus(session, clocks, findings)
+    tracks = {track.name: track for track in inputs.keypoints if track is not None}
+    check_keypoints(tracks, inputs.rig, findings)
+    check_imus(session, inputs.imus, findings)
     _check_amount(session, tracks, findings)
-    findings += unplaced_wearers(session)
-    complete = len(tracks) == len(session.cameras) and all(
-        track is not None for track in (*tracks.values(), *imus)
-    )
-    if complete and (tracks or imus):
-        try:
-            times_s = solve_times_s(
-                session, tuple(tracks.values()), [t for t in imus if t is not None]
-            )
-            _check_length(times_s, findings)
-        except FusecapError as error:
-            findings.add("error", str(session_file(path).name), str(error).split(": ", 1)[-1])
-    check_views(session, rig, tracks, findings)
-    return _sorted(findings)
+    if inputs.times_s is not None:
+        _check_length(inputs.times_s, findings)
+    check_views(session, inputs.rig, tracks, findings)
+    return findings.sorted()
 
 
-def _calibrated(session: Session, findings: Findings) -> tuple[Session, Clocks]:
-    """The session with its sensors' calibration, and its clocks, where their files are right."""
-    clocks = Clocks()
+def _told(session: Session) -> set[str]:
+    """Where nothing can be opened, as missing files and missing keypoints are told already."""
     settings = session.settings
-    if settings.sync is not None and settings.sync.is_file():
-        try:
-            clocks = session_clocks(session)
-        except FusecapError as error:
-            findings.add("error", "clocks", str(error), "fusecap calibrate sync writes it anew")
-    if settings.imu_calibration is not None and settings.imu_calibration.is_file():
-        try:
-            session = with_imu_calibration(session)
-        except FusecapError as error:
-            findings.add("error", "sensors", str(error))
-    return session, clocks
+    told = {
+        f"camera '{camera.name}'"
+        for camera in session.cameras
+        if camera.keypoints is None or not camera.keypoints.is_dir()
+    }
+    told |= {
+        f"imu '{imu.bone}' of '{subject.name}'"
+        for subject in session.subjects
+        for imu in subject.imus
+        if imu.file is None or not imu.file.is_file()
+    }
+    if settings.calibration is not None and not settings.calibration.exists():
+        told.add("calibration")
+    if settings.sync is not None and not settings.sync.is_file():
+        told.add("clocks")
+    return told
 
 
-def _sorted(findings: Findings) -> list[Finding]:
-    order: dict[Severity, int] = {"error": 0, "warning": 1, "info": 2}
-    return sorted(findings, key=lambda finding: order[finding.severity])
+def _calibrated(session: Session, findings: Findings) -> Session:
+    """The session with its sensors' calibration, where that file is right."""
+    calibration = session.settings.imu_calibration
+    if calibration is None or not calibration.is_file():
+        return session
+    try:
+        return with_imu_calibration(session)
+    except FusecapError as error:
+        findings.add("error", "sensors", str(error))
+        return session
 
 
 def _split(line: str) -> tuple[str, str]:
     where, _, found = line.partition(": ")
     return (where, found) if found else ("session", line)
-
-
-def _check_rig(session: Session, findings: Findings) -> Rig | None:
-    calibration = session.settings.calibration
-    if not session.cameras or (calibration is not None and not calibration.exists()):
-        return None
-    if calibration is None:
-        findings.add("error", "calibration", "is missing under [session]", PRINT_A_BOARD)
-        return None
-    try:
-        rig, odd = open_rig(session)
-    except FusecapError as error:
-        findings.add("error", "calibration", str(error))
-        return None
-    findings += odd
-    return rig
 
 
 def _check_length(times_s: np.ndarray, findings: Findings) -> None:

@@ -2,51 +2,40 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from fusecap.errors import FusecapError
 from fusecap.findings import Findings
 from fusecap.geometry.quaternions import from_wxyz
-from fusecap.sources.imu_files import read_imu
 from fusecap.sources.imu_files.track import ImuTrack
 from fusecap.sources.session import ImuSettings, Session
-from fusecap.sources.session_sensors import mount, sensor_notes
-from fusecap.sources.sync_files import Clocks
+from fusecap.sources.session_sensors import mount
 from fusecap.types import GRAVITY_M_S2
 
 
-def check_imus(session: Session, clocks: Clocks, findings: Findings) -> list[ImuTrack | None]:
-    """Per sensor its track on the session's clock, None where it cannot be read."""
-    tracks: list[ImuTrack | None] = []
+def check_imus(
+    session: Session, tracks: Mapping[str, Sequence[ImuTrack | None]], findings: Findings
+) -> None:
+    """Of every sensor that could be read, and how it sits on its bone."""
     for subject in session.subjects:
         unmounted = []
-        read: list[ImuTrack | None] = []
-        for imu in subject.imus:
+        for imu, track in zip(subject.imus, tracks[subject.name], strict=True):
+            if track is None:
+                continue
             where = f"imu '{imu.bone}' of '{subject.name}'"
-            track = None
-            if imu.file is not None and imu.file.is_file():
+            if imu.bone_from_imu_wxyz is None and subject.tpose_s is None:
+                unmounted.append(imu.bone)
+            else:
                 try:
-                    track = read_imu(
-                        imu.file, format=imu.format, sensor=imu.sensor, rate_hz=imu.rate_hz
-                    )
-                    if imu.bone_from_imu_wxyz is None and subject.tpose_s is None:
-                        unmounted.append(imu.bone)
-                    else:
-                        mount(subject.model_copy(update={"imus": (imu,)}), [track])
+                    mount(subject.model_copy(update={"imus": (imu,)}), [track])
                 except FusecapError as error:
                     findings.add("error", where, str(error).removeprefix(f"{where}: "))
-            read.append(track)
-            if track is not None:
-                _check_imu(where, imu, track, findings)
-                times_s = clocks.imu(subject.name, imu.bone).session_s(track.times_s)
-                track = replace(track, times_s=times_s)
-            tracks.append(track)
-        findings += sensor_notes(subject, read)
+                    continue
+            _check_imu(where, imu, track, findings)
         if unmounted:
             _add_unmounted(subject.name, unmounted, bool(session.cameras), findings)
-    return tracks
 
 
 def _add_unmounted(subject: str, bones: list[str], cameras: bool, findings: Findings) -> None:

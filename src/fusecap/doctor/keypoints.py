@@ -2,56 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from fusecap.body.landmarks import LANDMARK_SETS, LandmarkSet
-from fusecap.errors import FusecapError
 from fusecap.findings import Findings
 from fusecap.geometry.camera import Camera, Rig
-from fusecap.progress import Progress
-from fusecap.sources.keypoint_files import KeypointTrack, read_keypoints
-from fusecap.sources.session import Session
-from fusecap.sources.session_cameras import broken_files, common_landmarks
+from fusecap.sources.keypoint_files import KeypointTrack
 
 LOW_COVERAGE = 0.1
 
 
 def check_keypoints(
-    session: Session, rig: Rig | None, findings: Findings, progress: Progress | None
-) -> dict[str, KeypointTrack]:
-    """Per camera that could be read its track."""
-    tracks: dict[str, KeypointTrack] = {}
-    try:
-        landmarks = common_landmarks(session)
-    except FusecapError as error:
-        findings.add("error", "cameras", str(error).split(": ", 1)[-1])
-        return tracks
-    for camera in session.cameras:
-        where = f"camera '{camera.name}'"
-        if camera.keypoints is None or landmarks is None or not camera.keypoints.is_dir():
-            continue
-        try:
-            track = read_keypoints(
-                camera.keypoints,
-                name=camera.name,
-                landmarks=landmarks,
-                rate_hz=session.camera_rate_hz(camera),
-                offset_s=camera.offset_s,
-                own_times=camera.rate_hz is None,
-                progress=progress,
-            )
-        except FusecapError as error:
-            findings.add("error", where, str(error))
-            continue
-        tracks[camera.name] = track
-        if track.broken:
-            findings.append(broken_files(track))
+    tracks: Mapping[str, KeypointTrack], rig: Rig | None, findings: Findings
+) -> None:
+    """Of every camera that could be read."""
+    for name, track in tracks.items():
         _check_coverage(track, findings)
         _check_order(track, findings)
         if rig is not None:
-            _check_inside(track, rig[camera.name], findings)
+            _check_inside(track, rig[name], findings)
     _check_lengths(tracks, findings)
-    return tracks
 
 
 def _check_coverage(track: KeypointTrack, findings: Findings) -> None:
@@ -140,7 +112,7 @@ def _link_length(people: np.ndarray, landmarks: LandmarkSet) -> float:
     return float(np.nanmean(span)) if np.isfinite(span).any() else np.inf
 
 
-def _check_lengths(tracks: dict[str, KeypointTrack], findings: Findings) -> None:
+def _check_lengths(tracks: Mapping[str, KeypointTrack], findings: Findings) -> None:
     if len(tracks) < 2:
         return
     first = {name: float(track.times_s[0]) for name, track in tracks.items()}

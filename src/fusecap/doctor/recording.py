@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from fusecap.batch.replay import recorded_setup
-from fusecap.findings import Finding, Findings, Severity
+from fusecap.findings import Finding, Findings
 from fusecap.progress import Progress
 from fusecap.recording.reader import RecordedEvent, RecordedPose, Recording
 from fusecap.types import CameraSample, ImuSample, Tick
@@ -49,8 +49,7 @@ def diagnose_recording(path: Path | str, progress: Progress | None = None) -> li
     for subject, bones in sensors.items():
         for bone, times_ns in bones.items():
             _source(f"imu '{bone}' of '{subject}'", times_ns, findings)
-    order: dict[Severity, int] = {"error": 0, "warning": 1, "info": 2}
-    return sorted(findings, key=lambda finding: order[finding.severity])
+    return findings.sorted()
 
 
 def _whole(recording: Recording, findings: Findings) -> None:

@@ -97,15 +97,16 @@ def _landmark_set_name(session: Session, camera: CameraSettings) -> str:
 def open_keypoints(session: Session, progress: Progress | None = None) -> tuple[KeypointTrack, ...]:
     """Of all cameras, on their own clocks; raises `InputError`."""
     landmarks = common_landmarks(session)
-    return tuple(
-        _keypoints(session, index, landmarks, progress) for index in range(len(session.cameras))
-    )
+    return tuple(camera_track(session, camera, landmarks, progress) for camera in session.cameras)
 
 
-def _keypoints(
-    session: Session, index: int, landmarks: LandmarkSet | None, progress: Progress | None
+def camera_track(
+    session: Session,
+    camera: CameraSettings,
+    landmarks: LandmarkSet | None,
+    progress: Progress | None = None,
 ) -> KeypointTrack:
-    camera = session.cameras[index]
+    """Of one camera, on its own clock; raises `InputError`."""
     if camera.keypoints is None and camera.video is None:
         raise SessionError(
             f"{session.path}: camera '{camera.name}' is live only, nothing is recorded here; solve "

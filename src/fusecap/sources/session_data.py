@@ -8,14 +8,15 @@ session's rate are not interpolated at all.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
 from fusecap.body.landmarks import LandmarkSet
-from fusecap.errors import SessionError
+from fusecap.errors import FusecapError, SessionError
 from fusecap.findings import Finding
 from fusecap.geometry.camera import Rig
 from fusecap.progress import Progress
@@ -25,19 +26,22 @@ from fusecap.sources.keypoint_files import KeypointTrack
 from fusecap.sources.session import Session
 from fusecap.sources.session_cameras import (
     broken_files,
+    camera_track,
     common_landmarks,
-    open_keypoints,
     open_rig,
     with_detections,
 )
-from fusecap.sources.session_sensors import mount, open_imus, sensor_notes
-from fusecap.sources.sync_files import Clocks, read_sync
+from fusecap.sources.session_sensors import mount, open_some_imus, sensor_notes
+from fusecap.sources.sync_files import Clock, Clocks, read_sync
 from fusecap.sources.synchronizer import (
     MAX_GAP_S,
     people_at,
     resample_imus,
 )
 from fusecap.types import Detections, ImuReading
+
+T = TypeVar("T")
+Track = TypeVar("Track", KeypointTrack, ImuTrack)
 
 MAX_INSTANTS = 2_000_000
 """9 hours at 60 Hz: beyond this, clocks do not agree."""
@@ -107,37 +111,98 @@ class SessionData:
             yield detections.timestamp_ns, detections, readings
 
 
+@dataclass(frozen=True, kw_only=True)
+class OpenedInputs:
+    """What a session names, as far as it can be used: None stands for what cannot."""
+
+    rig: Rig | None
+    landmarks: LandmarkSet | None
+    clocks: Clocks
+    keypoints: tuple[KeypointTrack | None, ...]
+    """Per camera, on the session's clock."""
+    imus: dict[str, list[ImuTrack | None]]
+    """Per subject its sensors, on the session's clock."""
+    times_s: np.ndarray | None
+    """(T,) the instants; None unless all of the above can be used."""
+    findings: list[Finding]
+    """What is odd and was dealt with."""
+
+
+def open_inputs(
+    session: Session,
+    failed: Callable[[str, FusecapError], None],
+    progress: Progress | None = None,
+) -> OpenedInputs:
+    """Opens all inputs in the one order there is, for a solve and for doctor.
+
+    `failed` is told where something cannot be used and why: it raises, or notes it and goes on.
+    """
+
+    def attempt(where: str, opened: Callable[[], T]) -> T | None:
+        try:
+            return opened()
+        except FusecapError as error:
+            failed(where, error)
+            return None
+
+    def on_clock(track: Track, clock: Clock) -> Track:
+        return replace(track, times_s=clock.session_s(track.times_s))
+
+    rig, findings = attempt("calibration", lambda: open_rig(session)) or (None, [])
+    landmarks = attempt("cameras", lambda: common_landmarks(session))
+    clocks = attempt("clocks", lambda: session_clocks(session)) or Clocks()
+    keypoints: list[KeypointTrack | None] = []
+    for camera in session.cameras if landmarks else ():
+        track = attempt(
+            f"camera '{camera.name}'",
+            lambda c=camera: camera_track(session, c, landmarks, progress),
+        )
+        if track is not None:
+            if track.broken:
+                findings.append(broken_files(track))
+            track = on_clock(track, clocks.camera(track.name))
+        keypoints.append(track)
+    findings += unplaced_wearers(session)
+    imus: dict[str, list[ImuTrack | None]] = {}
+    for subject in session.subjects:
+        imus[subject.name] = [
+            track
+            and replace(track, times_s=clocks.imu(subject.name, imu.bone).session_s(track.times_s))
+            for imu, track in zip(subject.imus, open_some_imus(subject, attempt), strict=True)
+        ]
+        findings += sensor_notes(subject, imus[subject.name])
+    seen = tuple(track for track in keypoints if track is not None)
+    worn = [track for some in imus.values() for track in some if track is not None]
+    whole = len(seen) == len(session.cameras) and len(worn) == sum(map(len, imus.values()))
+    times_s = None
+    if whole and (seen or worn):
+        times_s = attempt(session.path.name, lambda: solve_times_s(session, seen, worn))
+    return OpenedInputs(
+        rig=rig,
+        landmarks=landmarks,
+        clocks=clocks,
+        keypoints=tuple(keypoints),
+        imus=imus,
+        times_s=times_s,
+        findings=findings,
+    )
+
+
 def open_session(session: Session, progress: Progress | None = None) -> SessionData:
     """Reads all inputs; raises `InputError` for the first that cannot be used.
 
     Cameras with a video need keypoints that were detected in it (`with_detections`).
     """
     session = with_detections(session)
-    rig, findings = open_rig(session)
-    landmarks = common_landmarks(session)
-    keypoints = open_keypoints(session, progress)
-    for track in keypoints:
-        if track.broken:
-            findings.append(broken_files(track))
-    clocks = session_clocks(session)
-    keypoints = tuple(
-        replace(track, times_s=clocks.camera(track.name).session_s(track.times_s))
-        for track in keypoints
-    )
-    findings += unplaced_wearers(session)
-    tracks = {}
-    for subject in session.subjects:
-        tracks[subject.name] = [
-            replace(track, times_s=clocks.imu(subject.name, imu.bone).session_s(track.times_s))
-            for imu, track in zip(subject.imus, open_imus(subject), strict=True)
-        ]
-        findings += sensor_notes(subject, tracks[subject.name])
-    times_s = solve_times_s(session, keypoints, [t for some in tracks.values() for t in some])
+    inputs = open_inputs(session, _refuse, progress)
+    if inputs.rig is None or inputs.times_s is None:
+        raise SessionError(f"{session.path}: neither a camera nor a sensor: nothing to solve")
     imus = []
     for subject in session.subjects:
         if subject.imus:
-            mounted = mount(subject, tracks[subject.name])
-            rotations, accelerations = resample_imus(mounted, times_s)
+            tracks = [track for track in inputs.imus[subject.name] if track is not None]
+            mounted = mount(subject, tracks)
+            rotations, accelerations = resample_imus(mounted, inputs.times_s)
             imus.append(
                 SubjectImus(
                     subject=subject.name,
@@ -149,14 +214,18 @@ def open_session(session: Session, progress: Progress | None = None) -> SessionD
             )
     return SessionData(
         session=session,
-        rig=rig,
-        landmarks=landmarks,
-        keypoints=keypoints,
+        rig=inputs.rig,
+        landmarks=inputs.landmarks,
+        keypoints=tuple(track for track in inputs.keypoints if track is not None),
         imus=tuple(imus),
-        times_s=times_s,
-        findings=tuple(findings),
+        times_s=inputs.times_s,
+        findings=tuple(inputs.findings),
         content_hash=content_hash(session),
     )
+
+
+def _refuse(where: str, error: FusecapError) -> None:
+    raise error
 
 
 def unplaced_wearers(session: Session) -> list[Finding]:

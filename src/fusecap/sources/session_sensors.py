@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,23 +17,36 @@ from fusecap.sources.synchronizer import MountedImu, world_from_imu_world
 
 
 def open_imus(subject: SubjectSettings) -> list[ImuTrack]:
-    """The subject's tracks on the session's clock.
+    """The subject's tracks on the recorder's clock, each with its `offset_s`.
 
-    Sensors that share a recorder's clock keep their mutual delays: the earliest starts at 0.
+    Sensors that share a recorder's clock keep their mutual delays: the earliest starts at 0. Raises
+    `InputError` for a sensor that cannot be read.
     """
-    tracks = []
-    for imu in subject.imus:
-        if imu.file is None:
-            raise SessionError(
-                f"imu '{imu.bone}' of '{subject.name}' is live only; name a file of its samples, "
-                "or use: fusecap live"
-            )
-        tracks.append(read_imu(imu.file, format=imu.format, sensor=imu.sensor, rate_hz=imu.rate_hz))
-    delays = _shared_delays_s(tracks)
-    return [
-        replace(track, times_s=track.times_s + delay + imu.offset_s)
-        for track, delay, imu in zip(tracks, delays, subject.imus, strict=True)
+    return [track for track in open_some_imus(subject, lambda _, read: read()) if track]
+
+
+def open_some_imus(
+    subject: SubjectSettings, attempt: Callable[[str, Callable[[], ImuTrack]], ImuTrack | None]
+) -> list[ImuTrack | None]:
+    """`open_imus`, where `attempt` says what becomes of a sensor that cannot be read."""
+    tracks = [
+        attempt(f"imu '{imu.bone}' of '{subject.name}'", lambda imu=imu: _read(subject, imu))
+        for imu in subject.imus
     ]
+    delays = iter(_shared_delays_s([track for track in tracks if track is not None]))
+    return [
+        track and replace(track, times_s=track.times_s + next(delays) + imu.offset_s)
+        for track, imu in zip(tracks, subject.imus, strict=True)
+    ]
+
+
+def _read(subject: SubjectSettings, imu: ImuSettings) -> ImuTrack:
+    if imu.file is None:
+        raise SessionError(
+            f"imu '{imu.bone}' of '{subject.name}' is live only; name a file of its samples, "
+            "or use: fusecap live"
+        )
+    return read_imu(imu.file, format=imu.format, sensor=imu.sensor, rate_hz=imu.rate_hz)
 
 
 def _shared_delays_s(tracks: list[ImuTrack]) -> list[float]:
