@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from derivatives import differences
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.body.prior import PosePrior
 from fusecap.body.shape import BodyShape
@@ -111,18 +112,15 @@ class Twin:
             total += 0.5 * (np.log1p(s) if robust else s)
         return total
 
-    def normal_equations(self, theta, step=1e-6):
+    def normal_equations(self, theta):
         """g and the reweighted Gauss-Newton H from central differences of every residual."""
         n = len(theta)
         centre = list(self.residuals(theta))
-        jacobians = [np.zeros((len(r), n)) for r, _ in centre]
-        for j in range(n):
-            delta = np.zeros(n)
-            delta[j] = step
-            plus = [r for r, _ in self.residuals(theta + delta)]
-            minus = [r for r, _ in self.residuals(theta - delta)]
-            for jacobian, p, m in zip(jacobians, plus, minus, strict=True):
-                jacobian[:, j] = (p - m) / (2 * step)
+        stacked = differences(
+            lambda delta: np.concatenate([r for r, _ in self.residuals(theta + delta)]), n
+        )
+        ends = np.cumsum([len(r) for r, _ in centre])[:-1]
+        jacobians = np.split(stacked, ends)
         g, h = np.zeros(n), np.zeros((n, n))
         for (r, robust), jacobian in zip(centre, jacobians, strict=True):
             weight = 1 / (1 + r @ r) if robust else 1.0

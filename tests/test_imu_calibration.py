@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from derivatives import assert_jacobian
 from fusecap.body.landmarks import landmark_set_named
 from fusecap.body.skeleton import PAPER21
 from fusecap.calibrate.imus.changes import find_change
@@ -122,11 +123,7 @@ def test_derivatives_by_mounting_heading_and_drift(rng):
         return _linearised(pairs, turned, heading + values[3] + values[4] * ahead_s, ahead_s, 5)[0]
 
     _, jacobian = _linearised(pairs, mounting, heading, ahead_s, 5)
-    for index in range(5):
-        step = np.zeros(5)
-        step[index] = 1e-6
-        numeric = (error(step) - error(-step)) / 2e-6
-        assert np.allclose(numeric, jacobian[:, :, index], atol=1e-6)
+    assert_jacobian(error, jacobian, atol=1e-6)
 
 
 def test_any_mounting_and_heading_is_found(rng):
@@ -360,11 +357,7 @@ def test_derivatives_of_landmarks_by_sensors_and_offsets(biased_arm, rng):
         return problem.residuals(moved, heading + own[:, 3], offsets + values[12:])[0]
 
     _, jacobian = problem.residuals(mounting, heading, offsets)
-    for column in range(problem.size):
-        step = np.zeros(problem.size)
-        step[column] = 1e-6
-        numeric = (error(step) - error(-step)) / 2e-6
-        assert np.allclose(numeric, jacobian[..., column], atol=1e-7)
+    assert_jacobian(error, jacobian, atol=1e-7)
 
 
 def test_nobody_seen_leaves_the_fits_as_they_are(biased_arm):

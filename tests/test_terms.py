@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from derivatives import assert_jacobian
 from fusecap.body.landmarks import LANDMARK_SETS
 from fusecap.body.shape import BodyShape
 from fusecap.body.skeleton import EXTENDED23, PAPER21
@@ -59,19 +60,14 @@ def assert_agrees(solver, twin, theta, data, *, hessian=True):
         np.testing.assert_allclose(matrix, expected_matrix, atol=2e-6 * scale)
 
 
-def assert_gradient_is_that_of_the_cost(solver, theta, data, step=1e-6):
+def assert_gradient_is_that_of_the_cost(solver, theta, data):
     _, gradient, _ = solver.evaluate(theta, data)
-    for j in range(len(theta)):
-        delta = np.zeros_like(theta)
-        delta[j] = step
-        plus, minus = (
-            solver.evaluate(theta + delta, data)[0],
-            solver.evaluate(theta - delta, data)[0],
-        )
-        numeric = (plus - minus) / (2 * step)
-        assert gradient[j] == pytest.approx(
-            numeric, rel=2e-4, abs=2e-4 * max(1, abs(gradient).max())
-        )
+    assert_jacobian(
+        lambda delta: solver.evaluate(theta + delta, data)[0],
+        gradient,
+        rtol=2e-4,
+        atol=2e-4 * max(1, abs(gradient).max()),
+    )
 
 
 @pytest.mark.parametrize("term", TERMS)
