@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from fusecap.batch.solve import solve_session
 from fusecap.errors import InputError, SessionError
 from fusecap.sources.session_cameras import open_keypoints
 from fusecap.sources.session_data import open_session
@@ -25,6 +26,7 @@ def complaint(tmp_path, text):
         ('rate_hz = "fast"\n', ["[[camera]] 'left' rate_hz", "'fast'", "a number"]),
         ("rate_hz = true\n", ["rate_hz", "True", "a number"]),
         ("rate_hz = 0\n", ["rate_hz", "0", "above zero"]),
+        ('[estimator]\nsmooth = "yes"\n', ["smooth", "'yes'"]),
         ("rate_hz = -25\n", ["rate_hz", "-25", "above zero"]),
         ("offset_s = nan\n", ["offset_s", "nan", "finite"]),
         ("offset_s = inf\n", ["offset_s", "finite"]),
@@ -244,3 +246,12 @@ def test_camera_that_is_live_only_cannot_be_solved(tmp_path):
     (tmp_path / "session.toml").write_text(text)
     with pytest.raises(SessionError, match="'left' is live only"):
         open_keypoints(load_session(tmp_path))
+
+
+def test_a_session_that_asks_for_it_is_solved_with_all_instants_together(tmp_path):
+    path = write_session(tmp_path)
+    alone = solve_session(open_session(load_session(tmp_path))).take
+    edit(path, "[session]", "[estimator]\nsmooth = true\n\n[session]")
+    smooth = solve_session(open_session(load_session(tmp_path))).take
+    np.testing.assert_allclose(smooth.theta[0, :, :3], alone.theta[0, :, :3], atol=0.1)
+    assert (smooth.theta[0] != alone.theta[0]).any(axis=1).all()

@@ -314,7 +314,7 @@ class WeightSettings(_Table):
 class EstimatorSettings(_Table):
     """`[estimator]`; None: the estimator's default."""
 
-    smooth: bool = False
+    smooth: Flag = False
     """Solve all instants of a person together, so that takes hold a motion."""
     weights: WeightSettings = WeightSettings()
     max_iterations: Annotated[int, Field(strict=True, ge=1)] | None = None
