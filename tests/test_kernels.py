@@ -14,6 +14,7 @@ from fusecap.body.pose import forward_kinematics
 from fusecap.body.shape import BodyShape
 from fusecap.body.skeleton import EXTENDED23, PAPER21
 from fusecap.kernels import cholesky, groups, kinematics, lie, projection
+from fusecap.kernels.terms.orientation import relative_quaternion
 from scenes import random_pose, ring
 
 vectors = arrays(np.float64, 3, elements=st.floats(-6.0, 6.0))
@@ -126,3 +127,13 @@ def test_cholesky_refuses_what_is_not_positive_definite():
     lower = np.zeros((2, 2))
     assert not cholesky.factor(np.diag([1.0, -1.0]), np.zeros(2), lower)
     assert not cholesky.factor(np.full((2, 2), np.nan), np.zeros(2), lower)
+
+
+@pytest.mark.parametrize("axis", [(1, 0.2, 0.1), (0.2, 1, 0.1), (0.1, 0.2, 1)])
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1.0, 3.0, 3.1415, 3.2])
+def test_relative_quaternions_are_those_of_scipy_about_every_axis(axis, angle, rng):
+    first = Rotation.random(rng=rng)
+    turn = Rotation.from_rotvec(angle * np.array(axis) / np.linalg.norm(axis))
+    relative = np.array(relative_quaternion(first.as_matrix(), (first * turn).as_matrix()))
+    expected = turn.as_quat()[[3, 0, 1, 2]]
+    np.testing.assert_allclose(relative, expected * (1 if expected[0] >= 0 else -1), atol=1e-9)
