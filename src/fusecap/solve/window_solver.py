@@ -3,7 +3,7 @@
 The front of `fusecap.kernels.window`. Instants are coupled three by three, so the normal equations
 are a band that LAPACK factors in time linear in the number of instants. Long takes are solved in
 pieces that overlap: each holds the last two poses of the piece before it, and looks `AHEAD`
-instants beyond what it keeps, so memory is flat and nothing jumps between pieces.
+instants beyond what it keeps, so what a solver holds does not grow and nothing jumps between pieces.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from fusecap.types import Observation
 
 PIECE = 120
 AHEAD = 30
-"""Half a second at 60 Hz: what comes later moves a pose by less than a tenth of a millimetre."""
+"""Half a second at 60 Hz; pieces then differ from the whole by under a millimetre (tests)."""
 LONGEST_STEP_S = 0.1
 """Longer gaps are not bridged: the motion ends and begins anew."""
 _HELD_INFORMATION = 1e12
