@@ -3,7 +3,8 @@
 The front of `fusecap.kernels.window`. Instants are coupled three by three, so the normal equations
 are a band that LAPACK factors in time linear in the number of instants. Long takes are solved in
 pieces that overlap: each holds the last two poses of the piece before it, and looks `AHEAD`
-instants beyond what it keeps, so what a solver holds does not grow and nothing jumps between pieces.
+instants beyond what it keeps, so what a solver holds does not grow and nothing jumps between
+pieces.
 """
 
 from __future__ import annotations
