@@ -54,6 +54,7 @@ def flat_prior(skeleton: Skeleton = PAPER21, seed: int = 0) -> PosePrior:
         mean=rng.normal(scale=0.05, size=size),
         basis=np.ascontiguousarray(basis),
         sigma=np.linspace(0.8, 0.1, rank),
+        acceleration=np.full(1 + skeleton.bone_count, 20.0),
         recipe={},
     )
 

@@ -111,13 +111,13 @@ def test_one_camera_and_two_subjects_is_refused(folder):
         solve(folder)
 
 
-def test_without_cameras_sensors_alone_give_motion_in_place(folder):
+def test_without_cameras_sensors_alone_give_motion_from_foot_to_foot(folder):
     without_tables(folder, "camera")
     solved = solve(folder)
     assert solved.take.tracked.all()
-    root = solved.take.theta[:, :, :3]
-    assert np.ptp(root[:, :, [0, 2]], axis=1).max() < 0.01
     truth = load_take(folder / "truth.npz")
+    moved = [np.diff(take.theta[:, :, [0, 2]], axis=1).sum(axis=1) for take in (solved.take, truth)]
+    assert np.abs(moved[0] - moved[1][: len(moved[0])]).max() < 0.3
     score = score_take(solved.take, truth, gate_m=5.0)
     assert score.orientation_error_deg.median < 12
 

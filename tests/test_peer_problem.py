@@ -108,6 +108,7 @@ def twin_of(problems, frame):
             mean=p["prior_mean"],
             basis=p["prior_basis"],
             sigma=p["prior_sigma"],
+            acceleration=np.ones(1 + PAPER21.bone_count),
             recipe={},
         ),
         data=problems.measurements(frame),

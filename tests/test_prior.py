@@ -136,7 +136,8 @@ def test_a_file_that_is_no_prior_is_an_input_error(tmp_path):
     np.savez(tmp_path / "other.npz", mean=np.zeros(3))
     with pytest.raises(InputError, match="not a pose prior"):
         load_prior(PAPER21, tmp_path / "other.npz")
-    np.savez(tmp_path / "list.npz", recipe=np.array(json.dumps([])), mean=0, basis=0, sigma=0)
+    arrays = dict.fromkeys(("mean", "basis", "sigma", "acceleration"), 0)
+    np.savez(tmp_path / "list.npz", recipe=np.array(json.dumps([])), **arrays)
     with pytest.raises(MotionError, match="for skeleton 'None'"):
         load_prior(PAPER21, tmp_path / "list.npz")
 
@@ -147,11 +148,13 @@ def test_a_file_that_is_no_prior_is_an_input_error(tmp_path):
         (lambda a: a["mean"].__setitem__(0, np.nan), "not a number"),
         (lambda a: a["sigma"].__setitem__(0, 0.0), "not positive"),
         (lambda a: a["basis"].__setitem__((0, 0), 2.0), "from orthonormal"),
+        (lambda a: a["acceleration"].__setitem__(3, 0.0), "acceleration"),
     ],
 )
 def test_an_impossible_prior_is_refused(change, message):
     prior = load_prior(PAPER21)
-    arrays = {name: getattr(prior, name).copy() for name in ("mean", "basis", "sigma")}
+    names = ("mean", "basis", "sigma", "acceleration")
+    arrays = {name: getattr(prior, name).copy() for name in names}
     change(arrays)
     with pytest.raises(MotionError, match=message):
         PosePrior(skeleton_name="paper21", recipe={}, **arrays)
@@ -165,6 +168,7 @@ def test_arrays_of_another_skeleton_are_refused():
             mean=wide.mean,
             basis=wide.basis,
             sigma=wide.sigma,
+            acceleration=wide.acceleration,
             recipe={},
         )
 

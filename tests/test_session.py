@@ -26,7 +26,8 @@ def complaint(tmp_path, text):
         ('rate_hz = "fast"\n', ["[[camera]] 'left' rate_hz", "'fast'", "a number"]),
         ("rate_hz = true\n", ["rate_hz", "True", "a number"]),
         ("rate_hz = 0\n", ["rate_hz", "0", "above zero"]),
-        ('[estimator]\nsmooth = "yes"\n', ["smooth", "'yes'"]),
+        ('[estimator]\nwindow = "long"\n', ["window", "'long'"]),
+        ("[estimator]\nwindow = 2000\n", ["window", "1000"]),
         ("rate_hz = -25\n", ["rate_hz", "-25", "above zero"]),
         ("offset_s = nan\n", ["offset_s", "nan", "finite"]),
         ("offset_s = inf\n", ["offset_s", "finite"]),
@@ -248,10 +249,16 @@ def test_camera_that_is_live_only_cannot_be_solved(tmp_path):
         open_keypoints(load_session(tmp_path))
 
 
-def test_a_session_that_asks_for_it_is_solved_with_all_instants_together(tmp_path):
+def test_a_session_may_ask_for_each_instant_alone(tmp_path):
     path = write_session(tmp_path)
+    together = solve_session(open_session(load_session(tmp_path))).take
+    edit(path, "[session]", "[estimator]\nwindow = 1\n\n[session]")
     alone = solve_session(open_session(load_session(tmp_path))).take
-    edit(path, "[session]", "[estimator]\nsmooth = true\n\n[session]")
-    smooth = solve_session(open_session(load_session(tmp_path))).take
-    np.testing.assert_allclose(smooth.theta[0, :, :3], alone.theta[0, :, :3], atol=0.1)
-    assert (smooth.theta[0] != alone.theta[0]).any(axis=1).all()
+    np.testing.assert_allclose(together.theta[0, :, :3], alone.theta[0, :, :3], atol=0.1)
+    assert (together.theta[0] != alone.theta[0]).any(axis=1).all()
+
+
+def test_a_window_of_two_is_refused(tmp_path):
+    edit(write_session(tmp_path), "[session]", "[estimator]\nwindow = 2\n\n[session]")
+    with pytest.raises(InputError, match="3-1000 instants, or 1"):
+        solve_session(open_session(load_session(tmp_path)))

@@ -23,7 +23,7 @@ from scenes import IMU13, flat_prior, measure, pose_error_mm_deg, ring
 
 LANDMARKS = LANDMARK_SETS["body25"]
 SHAPE = BodyShape.from_height(PAPER21, 1.75)
-WEAK_PRIOR = SolverOptions(weights=Weights(projection=1e-4, deviation=1e-5, floor=0.0))
+WEAK_PRIOR = SolverOptions(weights=Weights(projection=1e-4, deviation=1e-5, floor=0.0).alone())
 
 
 def standing(x=0.0, z=0.0, heading=0.0):

@@ -78,3 +78,14 @@ def motion(weights, theta, times_s):
             turn = (r1.inv() * r2).as_rotvec() / h1 - (r0.inv() * r1).as_rotvec() / h0
             cost += heavy_tailed(weight, turn / mean)
     return cost
+
+
+def rest(shape, floor_bones, weight, contact, theta, times_s):
+    """What stands does not move: r = (x₁ - x₀) / h, counted by `contact` (T, F)."""
+    cost = 0.0
+    for t in range(1, len(theta)):
+        before, after = bones_in_world(shape, theta[t - 1])[1], bones_in_world(shape, theta[t])[1]
+        for share, bone in zip(contact[t], floor_bones, strict=True):
+            speed = (after[bone] - before[bone]) / (times_s[t] - times_s[t - 1])
+            cost += share * heavy_tailed(weight, speed)
+    return cost

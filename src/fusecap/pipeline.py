@@ -100,6 +100,18 @@ def _own_sorter(setup: Setup) -> Sorter | None:
     return Tracker(setup.rig, setup.landmarks, options, named)
 
 
+def make_estimator(setup: Setup, model: SubjectModel) -> Estimator:
+    """An estimator as a pipeline of this setup uses it."""
+    return Estimator(
+        model,
+        rig=setup.rig,
+        landmarks=setup.landmarks.of(model.name),
+        prior=setup.prior,
+        skeleton=setup.skeleton,
+        options=setup.options,
+    )
+
+
 class Pipeline:
     """Sorts and solves one instant after the other."""
 
@@ -146,17 +158,6 @@ class Pipeline:
             estimates=tuple(estimate for estimate in results if estimate is not None),
         )
         return self._step
-
-    def make_estimator(self, model: SubjectModel) -> Estimator:
-        """An estimator as this pipeline uses it."""
-        return Estimator(
-            model,
-            rig=self._setup.rig,
-            landmarks=self._setup.landmarks.of(model.name),
-            prior=self._setup.prior,
-            skeleton=self._setup.skeleton,
-            options=self._setup.options,
-        )
 
     def estimator(self, name: str) -> Estimator:
         """The estimator of a subject that has been followed."""
@@ -260,7 +261,7 @@ class Pipeline:
 
     def _estimator(self, name: str) -> Estimator:
         if name not in self._estimators:
-            self._estimators[name] = self.make_estimator(self.model(name))
+            self._estimators[name] = make_estimator(self._setup, self.model(name))
         return self._estimators[name]
 
 

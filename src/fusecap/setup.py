@@ -19,7 +19,7 @@ from fusecap.body.skeleton import Skeleton
 from fusecap.errors import SessionError
 from fusecap.geometry.camera import Rig
 from fusecap.solve.estimator import SubjectModel
-from fusecap.solve.options import SMOOTH, SolverOptions, Weights
+from fusecap.solve.options import SolverOptions, Weights
 from fusecap.solve.pose_solver import ImuSites
 from fusecap.sources.offset_files import read_offsets
 from fusecap.sources.session import Session, SubjectSettings
@@ -111,13 +111,12 @@ def setup_of(session: Session, rig: Rig, landmarks: LandmarkSet | None) -> Setup
 def solver_options(session: Session) -> SolverOptions:
     """Defaults with what `[estimator]` and `floor` change."""
     given = session.estimator
-    weights = dict(SMOOTH) if given.smooth else {}
-    weights |= {name: w for name, w in given.weights.model_dump().items() if w is not None}
+    weights = {name: w for name, w in given.weights.model_dump().items() if w is not None}
     if not session.settings.floor:
         weights["floor"] = 0.0
     named = {
         name: value
-        for name in ("max_iterations", "function_tolerance", "floor_radius_m")
+        for name in ("window", "max_iterations", "function_tolerance", "floor_radius_m")
         if (value := getattr(given, name)) is not None
     }
     return SolverOptions(weights=Weights.named(**weights), **named)

@@ -1,10 +1,9 @@
-"""A recorded session to a take: sort, solve, then smooth.
+"""A recorded session to a take: sort, then solve.
 
-The first pass sorts and solves every instant as a live run would, and learns the bodies of people
-nobody measured. The second solves each subject again from the keypoints it was assigned, with one
-body throughout, and from the instant it was first seen rather than the one it was confirmed at.
-Then all instants of a subject are solved together (`fusecap.solve.window_solver`), which makes a
-motion of poses; with no term between instants in the weights that is left out.
+The first pass sorts and solves every instant, each alone, and learns the bodies of people nobody
+measured. The second solves each subject again from the keypoints it was assigned, with one body
+throughout, from the instant it was first seen rather than the one it was confirmed at: as a live
+run would, in a short window, and then in one so long that its poses are those of the whole take.
 
 Interrupted (Ctrl-C), either pass ends at the instant it had reached and the take holds what was
 solved.
@@ -13,21 +12,23 @@ solved.
 from __future__ import annotations
 
 import time
-from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections import Counter, deque
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Float
 
-from fusecap.body.pose import forward_kinematics
 from fusecap.body.shape import BodyShape
 from fusecap.files import plain
-from fusecap.pipeline import Pipeline, observation_of
+from fusecap.pipeline import Pipeline, make_estimator, observation_of
 from fusecap.progress import Progress
 from fusecap.setup import Setup, setup_of
+from fusecap.solve.estimator import Estimator
 from fusecap.solve.reprojection import Reprojection
-from fusecap.solve.window_solver import WindowSolver
+from fusecap.solve.whole_motion import AHEAD, PIECE, WholeMotion
+from fusecap.solve.window_solver import Workspace
 from fusecap.sources.session_data import SessionData
 from fusecap.take import Take, TakeBuilder, provenance
 from fusecap.types import (
@@ -39,6 +40,10 @@ from fusecap.types import (
     TrackState,
     TrackUpdate,
 )
+
+SEEDING_WINDOW = 4
+"""Instants that the second pass starts from together: where no camera sees the subject, an instant
+alone would stay where it is, and a long window would not find out that people walk."""
 
 
 @runtime_checkable
@@ -130,7 +135,7 @@ def solve_instants(
 ) -> Solved:
     """Both passes over recorded instants."""
     started = time.perf_counter()
-    pipeline = Pipeline(setup)
+    pipeline = Pipeline(_with_window(setup, 1))
     tracked = _first_pass(pipeline, instants, progress)
     reprojection = Reprojection(setup.rig, setup.landmarks)
     builder = TakeBuilder(
@@ -144,27 +149,28 @@ def solve_instants(
         ),
     )
     second = _SecondPass(setup, pipeline, tracked)
-    times_ns: list[int] = []
     solve_s, statuses = [], Counter()
     interrupted = tracked.interrupted
+
+    def keep(finished: Iterator[_Instant]) -> None:
+        for instant in finished:
+            people = instant.people.values()
+            builder.add(instant.timestamp_ns, [estimate for estimate, _ in people])
+            for estimate, observation in people:
+                reprojection.add(estimate, observation.keypoints)
+
     try:
         for instant, updates in enumerate(tracked.updates):
             detections = instants.detections(instant)
-            times_ns.append(detections.timestamp_ns)
             for estimate in second.step(detections, instants.readings(instant), updates):
                 solve_s.append(estimate.solve_s)
                 statuses[estimate.status.name.lower()] += 1
+            keep(second.finished())
             if progress:
                 progress("solving", instant + 1, len(tracked.updates))
-        if setup.options.weights.between_instants:
-            second.smooth(progress)
     except KeyboardInterrupt:
         interrupted = True
-    for timestamp_ns in times_ns:
-        estimates = second.solved.get(timestamp_ns, [])
-        builder.add(timestamp_ns, [estimate for estimate, _ in estimates])
-        for estimate, observation in estimates:
-            reprojection.add(estimate, observation.keypoints)
+    keep(second.rest())
     take = builder.build()
     solve_ms = np.array(solve_s or [np.nan]) * 1e3
     return Solved(
@@ -184,6 +190,10 @@ def solve_instants(
             notes=notes,
         ),
     )
+
+
+def _with_window(setup: Setup, window: int) -> Setup:
+    return replace(setup, options=replace(setup.options, window=window))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -239,18 +249,71 @@ def _named(updates: tuple[TrackUpdate, ...], names: Mapping[int, str]) -> list[T
     return list(taken.values())
 
 
+@dataclass(slots=True)
+class _Instant:
+    """One instant of the second pass, open while some motion may still change it."""
+
+    timestamp_ns: int
+    people: dict[str, tuple[Estimate, Observation]] = field(default_factory=dict)
+    """Each estimate with what it was solved from."""
+    held: int = 0
+    """By how many motions."""
+
+
+class _Motion:
+    """One subject's part of the second pass."""
+
+    def __init__(self, estimator: Estimator, workspace: Workspace) -> None:
+        self._estimator = estimator
+        self._motion = WholeMotion(estimator.solver, workspace)
+        self._held: deque[_Instant] = deque()
+
+    def take(self, instant: _Instant, estimate: Estimate, observation: Observation) -> None:
+        """The subject's next instant."""
+        self._held.append(instant)
+        instant.held += 1
+        self._settle(self._motion.push(observation, estimate.theta))
+
+    def end_before(self, timestamp_ns: int) -> None:
+        """End a motion that an instant does not go on."""
+        if self._held and not self._motion.goes_on(timestamp_ns):
+            self.end()
+
+    def end(self) -> None:
+        """What is held gets its last poses."""
+        self._settle(self._motion.end())
+
+    def _settle(self, poses: Float[np.ndarray, "n p"]) -> None:
+        name = self._estimator.model.name
+        for theta in poses:
+            instant = self._held.popleft()
+            estimate, observation = instant.people[name]
+            position, rotation = self._estimator.solver.posed(theta)
+            settled = replace(
+                estimate,
+                theta=theta,
+                bone_position_in_world_m=position,
+                bone_rotation_in_world=rotation,
+            )
+            instant.people[name] = (settled, observation)
+            instant.held -= 1
+
+
 class _SecondPass:
-    """Solves people from assignments that stand, then each one's instants together."""
+    """Solves people from assignments that stand, each in a window of many instants."""
 
     def __init__(self, setup: Setup, pipeline: Pipeline, tracked: _Tracked) -> None:
-        self.solved: dict[int, list[tuple[Estimate, Observation]]] = {}
-        """By timestamp, each estimate with what it was solved from."""
         self._landmark_count = len(setup.landmarks.landmark_names)
-        self._estimators = {}
+        self._open: deque[_Instant] = deque()
+        self._estimators: dict[str, Estimator] = {}
+        self._motions: dict[str, _Motion] = {}
+        seeding = _with_window(setup, min(setup.options.window, SEEDING_WINDOW))
+        workspace = Workspace(setup.skeleton, PIECE + AHEAD) if setup.options.together else None
         for name, shape in tracked.shapes.items():
-            estimator = pipeline.make_estimator(pipeline.model(name))
+            estimator = self._estimators[name] = make_estimator(seeding, pipeline.model(name))
             estimator.set_shape(shape)
-            self._estimators[name] = estimator
+            if workspace is not None:
+                self._motions[name] = _Motion(estimator, workspace)
 
     def step(
         self,
@@ -258,51 +321,36 @@ class _SecondPass:
         readings: Mapping[str, ImuReading],
         updates: Sequence[TrackUpdate],
     ) -> list[Estimate]:
-        """One instant, every subject alone."""
-        solved = []
+        """One instant, every subject alone; see `finished`."""
+        instant = _Instant(detections.timestamp_ns)
+        for motion in self._motions.values():
+            motion.end_before(instant.timestamp_ns)
         for update in updates:
+            name = update.name
             observation = observation_of(
-                update, detections, self._landmark_count, readings.get(update.name)
+                update, detections, self._landmark_count, readings.get(name)
             )
-            estimate = self._estimators[update.name].follow(
+            estimate = self._estimators[name].follow(
                 update.track_id, observation, update.landmarks_in_world_m
             )
-            if estimate is not None:
-                solved.append((estimate, observation))
-        self.solved[detections.timestamp_ns] = solved
-        return [estimate for estimate, _ in solved]
-
-    def smooth(self, progress: Progress | None) -> None:
-        """Replace the poses by those of the motion that they belong to; one subject at a time."""
-        for done, (name, estimator) in enumerate(self._estimators.items()):
-            if progress:
-                progress("smoothing", done, len(self._estimators))
-            rows = [
-                (times_ns, index)
-                for times_ns, people in self.solved.items()
-                for index, (estimate, _) in enumerate(people)
-                if estimate.name == name and estimate.status is not Status.DIVERGED
-            ]
-            own = [self.solved[times_ns][index] for times_ns, index in rows]
-            if not own:
+            if estimate is None:
                 continue
-            theta = WindowSolver(estimator.solver).smooth(
-                np.stack([estimate.theta for estimate, _ in own]),
-                [observation for _, observation in own],
-            )
-            position, rotation = forward_kinematics(estimator.shape, theta)
-            for k, ((times_ns, index), (estimate, observation)) in enumerate(
-                zip(rows, own, strict=True)
-            ):
-                smoothed = replace(
-                    estimate,
-                    theta=theta[k],
-                    bone_position_in_world_m=position[k],
-                    bone_rotation_in_world=rotation[k],
-                )
-                self.solved[times_ns][index] = (smoothed, observation)
-        if progress:
-            progress("smoothing", len(self._estimators), len(self._estimators))
+            instant.people[name] = (estimate, observation)
+            if name in self._motions and estimate.status is not Status.DIVERGED:
+                self._motions[name].take(instant, estimate, observation)
+        self._open.append(instant)
+        return [estimate for estimate, _ in instant.people.values()]
+
+    def finished(self) -> Iterator[_Instant]:
+        """Instants whose poses are their last ones, in order."""
+        while self._open and not self._open[0].held:
+            yield self._open.popleft()
+
+    def rest(self) -> Iterator[_Instant]:
+        """All that are still open, once nothing more comes."""
+        for motion in self._motions.values():
+            motion.end()
+        yield from self.finished()
 
 
 def describe_subjects(take: Take) -> dict[str, dict[str, float]]:

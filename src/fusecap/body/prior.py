@@ -1,4 +1,4 @@
-"""The PCA pose prior: which poses people take, as a mean, a basis and its deviations.
+"""The prior: which poses people take, as a mean, a basis and its deviations, and how they move.
 
 With x the angle-axis vectors of every bone but the root, the solver adds two terms [1, eq. 14-15]:
 
@@ -25,7 +25,7 @@ from jaxtyping import Float
 from fusecap.body.skeleton import Skeleton, skeleton_named
 from fusecap.errors import InputError, MotionError
 
-_ARRAYS = ("mean", "basis", "sigma")
+_ARRAYS = ("mean", "basis", "sigma", "acceleration")
 _ORTHONORMAL_TOLERANCE = 1e-5
 
 
@@ -40,6 +40,9 @@ class PosePrior:
     """M, orthonormal columns."""
     sigma: Float[np.ndarray, " r"]
     """Standard deviations along the columns of `basis` [rad]."""
+    acceleration: Float[np.ndarray, " n"]
+    """(1 + B,) root mean square accelerations in ordinary motion: of the root's place [m/s²], then
+    of every joint [rad/s²]."""
     recipe: Mapping[str, object]
     """How it was trained, for JSON."""
 
@@ -54,6 +57,11 @@ class PosePrior:
             )
         if not all(np.all(np.isfinite(getattr(self, name))) for name in _ARRAYS):
             raise MotionError(f"pose prior of '{self.skeleton_name}': a value is not a number")
+        if self.acceleration.shape != (2 + size // 3,) or np.any(self.acceleration <= 0):
+            raise MotionError(
+                f"pose prior of '{self.skeleton_name}': acceleration has shape "
+                f"{self.acceleration.shape}; expected {2 + size // 3} positive numbers"
+            )
         if np.any(self.sigma <= 0):
             raise MotionError(f"pose prior of '{self.skeleton_name}': a deviation is not positive")
         error = np.abs(self.basis.T @ self.basis - np.eye(rank)).max()
@@ -109,6 +117,7 @@ def save_prior(prior: PosePrior, path: Path) -> None:
         mean=prior.mean.astype(np.float32),
         basis=prior.basis.astype(np.float32),
         sigma=prior.sigma.astype(np.float32),
+        acceleration=prior.acceleration.astype(np.float32),
         recipe=np.array(json.dumps(recipe)),
     )
 

@@ -30,6 +30,7 @@ _HELP = {
     "figure9": "Figure 9 on the simulated twin: the weight of the acceleration term.",
     "figure10": "Figure 10 on the simulated twin: the floor term on and off.",
     "tuning": "How the orientation weight was chosen, on the twin's training takes.",
+    "motion": "Instants alone and together: live, 100 ms late, recorded.",
     "people": "Several people on the simulated twin: two, four, bystanders, close interaction.",
 }
 _COMMON = (
@@ -56,7 +57,11 @@ def _command(name: str) -> Callable[..., None]:
         ] = None,
         seed: Annotated[int, typer.Option(min=0, help="Of the simulated faults.")] = 0,
         weights: Annotated[
-            str, typer.Option(help="default, paper, or no-acceleration: the paper's without it.")
+            str,
+            typer.Option(
+                help="default; alone: no term between instants; paper; no-acceleration: the "
+                "paper's without that term."
+            ),
         ] = "default",
         quick: Annotated[
             bool, typer.Option("--quick", help="Two sequences and fewer configurations.")

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from fusecap.body.landmarks import LandmarkOffsets, LandmarkSet
 from fusecap.evaluate.metrics import aligned_error_m, position_error_m, summarize
 from fusecap.evaluate.score import score_take
-from fusecap.evaluate.simulated_solve import solve_simulation
+from fusecap.evaluate.simulated_solve import live_takes, solve_simulation
 from fusecap.evaluate.simulator import Simulation
 from fusecap.evaluate.twin import (
     GROUPS,
@@ -33,6 +33,7 @@ LIMBS_12 = tuple(
 )
 """The keypoints that Malleson et al. (2017) used: K12 of the paper's table 3."""
 
+LATE_S = 0.1
 _SPINE = ("spine", "spine1", "spine2", "spine3")
 """The joints that Human3.6M does not have; 17 of 21 remain [1, sec. 4.1.3]."""
 
@@ -61,6 +62,8 @@ class TwinCell:
     body: Literal["measured", "height"] = "measured"
     """What the solver knows of the bones: true lengths, or proportions of the stature."""
     seed: int = 0
+    live: bool = False
+    """Also score what a live run has: the newest pose, and one settled for `LATE_S`."""
     trace: bool = False
     """Return the height and depth of the root over time as well."""
 
@@ -68,13 +71,11 @@ class TwinCell:
 def solve_cell(cell: TwinCell) -> dict[str, Any]:
     """Score, root trace and times of one solve; NaN becomes None."""
     simulation = simulation_of(cell)
-    weights = Weights.named(**cell.weights)
-    solved = solve_simulation(
-        simulation, options=SolverOptions(weights=weights), associate=cell.associate
-    )
-    alone = len(simulation.people) == 1
+    options = SolverOptions(weights=Weights.named(**cell.weights))
+    solved = solve_simulation(simulation, options=options, associate=cell.associate)
     # One person is who they are, however far away the estimate has drifted.
-    score = score_take(solved.take, simulation.truth, gate_m=np.inf if alone else 0.5)
+    gate_m = np.inf if len(simulation.people) == 1 else 0.5
+    score = score_take(solved.take, simulation.truth, gate_m=gate_m)
     result = {
         "score": asdict(score),
         "floor": below_floor(solved.take),
@@ -83,6 +84,10 @@ def solve_cell(cell: TwinCell) -> dict[str, Any]:
         "solve_ms_p99": solved.report.solve_ms_p99,
         "frames": solved.report.instants,
     }
+    if cell.live:
+        newest, settled = live_takes(simulation, options=options, lag_s=LATE_S)
+        result["newest"] = asdict(score_take(newest, simulation.truth, gate_m=gate_m))
+        result["settled"] = asdict(score_take(settled, simulation.truth, gate_m=gate_m))
     if cell.trace:
         result["root_m"] = np.round(solved.take.theta[0, :, :3], 5).tolist()
         result["true_root_m"] = np.round(simulation.truth.theta[0, :, :3], 5).tolist()

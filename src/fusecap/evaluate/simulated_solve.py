@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict
 
 import numpy as np
 
@@ -10,12 +11,14 @@ from fusecap.associate.options import TrackerOptions
 from fusecap.batch.solve import Solved, solve_instants
 from fusecap.body.prior import PosePrior, load_prior
 from fusecap.evaluate.simulator import Simulation
+from fusecap.pipeline import Pipeline
 from fusecap.progress import Progress
 from fusecap.setup import Setup
 from fusecap.solve.estimator import SubjectModel
 from fusecap.solve.options import SolverOptions
 from fusecap.solve.pose_solver import ImuSites
-from fusecap.types import Detections, ImuReading
+from fusecap.take import Take, TakeBuilder, provenance
+from fusecap.types import Detections, Estimate, ImuReading
 
 
 def solve_simulation(
@@ -27,6 +30,59 @@ def solve_simulation(
     progress: Progress | None = None,
 ) -> Solved:
     """Solve knowing the heights and start positions of the subjects, as a session states them."""
+    setup = setup_of_simulation(simulation, options=options, prior=prior, associate=associate)
+    return solve_instants(setup, _Instants(simulation), progress=progress, simulated=True)
+
+
+def live_takes(
+    simulation: Simulation,
+    *,
+    options: SolverOptions | None = None,
+    lag_s: float,
+    progress: Progress | None = None,
+) -> tuple[Take, Take]:
+    """What a live run has: every pose as it comes, and as it is `lag_s` later.
+
+    The last instants of the second have not settled and are missing.
+    """
+    setup = setup_of_simulation(simulation, options=options)
+    pipeline, instants = Pipeline(setup), _Instants(simulation)
+    times_ns: list[int] = []
+    newest: dict[int, list[Estimate]] = {}
+    settled: dict[int, list[Estimate]] = {}
+    for instant in range(len(instants)):
+        step = pipeline.step(instants.detections(instant), instants.readings(instant))
+        times_ns.append(simulation.detections[instant].timestamp_ns)
+        newest[times_ns[-1]] = list(step.estimates)
+        for estimate in step.estimates:
+            late = pipeline.estimator(estimate.name).settled(lag_s)
+            if late is not None:
+                settled.setdefault(late.timestamp_ns, []).append(late)
+        if progress:
+            progress("solving as live", instant + 1, len(instants))
+    return _take(setup, times_ns, newest), _take(setup, times_ns, settled)
+
+
+def _take(setup: Setup, times_ns: list[int], estimates: Mapping[int, list[Estimate]]) -> Take:
+    builder = TakeBuilder(
+        skeleton=setup.skeleton,
+        rate_hz=setup.rate_hz,
+        subject_names=[model.name for model in setup.subjects],
+        provenance=provenance(options={"solver": asdict(setup.options)}, simulated=True),
+    )
+    for timestamp_ns in times_ns:
+        builder.add(timestamp_ns, estimates.get(timestamp_ns, []))
+    return builder.build()
+
+
+def setup_of_simulation(
+    simulation: Simulation,
+    *,
+    options: SolverOptions | None = None,
+    prior: PosePrior | None = None,
+    associate: str = "tracker",
+) -> Setup:
+    """Heights and start positions of the subjects known."""
     people = simulation.subjects
     skeleton = people[0].shape.skeleton
     models = []
@@ -45,7 +101,7 @@ def solve_simulation(
                 start_m=(float(person.theta[0, 0]), float(person.theta[0, 2])),
             )
         )
-    setup = Setup(
+    return Setup(
         rig=simulation.rig,
         landmarks=simulation.landmark_set,
         skeleton=skeleton,
@@ -56,7 +112,6 @@ def solve_simulation(
         prior=prior or load_prior(skeleton),
         options=options or SolverOptions(),
     )
-    return solve_instants(setup, _Instants(simulation), progress=progress, simulated=True)
 
 
 class _Instants:

@@ -25,6 +25,7 @@ class TermWeights(NamedTuple):
     motion: Any
     increment: Any
     specific_force: Any
+    rest: Any
 
 
 class Body(NamedTuple):
@@ -58,10 +59,11 @@ class Prior(NamedTuple):
 
 
 class Floor(NamedTuple):
-    """Joints that stay above the floor (F,), and by how much [m]."""
+    """Joints that stay above the floor (F,), by how much [m]; joints that may rest (R,)."""
 
     bone: Any
     radius: Any
+    resting: Any
 
 
 class Model(NamedTuple):
@@ -94,14 +96,16 @@ class Window(NamedTuple):
     """N instants.
 
     Keypoints (N, C, K, 3); sensor rotations (N, I, 3, 3), present (N, I) or not, specific force in
-    the bone's frame (N, I, 3); steps between instants (N - 1,) [s]; steadiness (1 + B,) of the
-    root's place and of every joint, one over the variance of their changes of velocity.
+    the bone's frame (N, I, 3); contact (N, R) of joints that rest from the instant before to this
+    one; steps between instants (N - 1,) [s]; steadiness (1 + B,) of the root's place and of every
+    joint, one over their mean square acceleration.
     """
 
     keypoints: Any
     rotation: Any
     present: Any
     force: Any
+    contact: Any
     steps: Any
     steadiness: Any
 
@@ -156,12 +160,12 @@ BODY = _group(Body, _bones, _matrix)
 LANDMARKS = _group(Landmarks, _bones, _matrix, _matrix)
 SENSORS = _group(SensorSites, _bones, _matrix)
 PRIOR = _group(Prior, _vector, _matrix, _matrix)
-FLOOR = _group(Floor, _bones, f8)
+FLOOR = _group(Floor, _bones, f8, _bones)
 MODEL = _group(Model, WEIGHTS, BODY, LANDMARKS, SENSORS, PRIOR, FLOOR)
 MEASURED = _group(Measured, _cube, _cube, _vector, _matrix, _cube, f8)
 POSED = _group(Posed, _matrix, _cube, _cube)
 GATHERED = _group(Gathered, _cube, _matrix)
-WINDOW = _group(Window, _cubes, _cubes, _matrix, _cube, _vector, _vector)
+WINDOW = _group(Window, _cubes, _cubes, _matrix, _cube, _matrix, _vector, _vector)
 POSED_WINDOW = _group(Posed, _cube, _cubes, _cubes)
 GATHERED_WINDOW = _group(Gathered, f8[:, :, :, :, ::1], _cube)
 SCRATCH = _group(Scratch, _matrix, _matrix, _vector, _cube, _matrix)

@@ -7,6 +7,7 @@ up the chain into the blocks (t, t), (t, t - 1) and (t, t - 2).
 from __future__ import annotations
 
 from numba import float64 as f8
+from numba import int64 as i8
 
 from fusecap.kernels.between import assemble_between, joint_motions
 from fusecap.kernels.groups import (
@@ -28,17 +29,19 @@ from fusecap.kernels.terms.motion import add_motion
 from fusecap.kernels.terms.orientation import add_orientation
 from fusecap.kernels.terms.position import add_position
 from fusecap.kernels.terms.prior import add_prior
+from fusecap.kernels.terms.rest import add_rest
 from fusecap.kernels.terms.specific_force import add_specific_force
 
 
 @kernel(
     f8(
-        f8[:, ::1], MODEL, WINDOW, POSED_WINDOW, GATHERED_WINDOW, SCRATCH,
+        f8[:, ::1], i8, MODEL, WINDOW, POSED_WINDOW, GATHERED_WINDOW, SCRATCH,
         f8[:, :, :, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[:, :, :, ::1], f8[:, ::1],
     )
 )  # fmt: skip
 def evaluate_window(
     theta,
+    owned,
     model,
     window,
     posed,
@@ -54,8 +57,9 @@ def evaluate_window(
 ):
     """Cost at theta (N, P), with H (N, 3, P, P) and g (N, P).
 
-    H[t, k] couples instants t and t - k, its lower triangle where k = 0. motions (N, B, 6, 3),
-    lever (3, 3, 6) and square (10, 3, 3).
+    Only terms that touch one of the first `owned` instants count. H[t, k] couples instants t and
+    t - k, its lower triangle where k = 0. motions (N, B, 6, 3), lever (3, 3, 6) and square
+    (10, 3, 3).
     """
     weights, prior, sensors = model.weights, model.prior, model.sensors
     count = theta.shape[0]
@@ -69,17 +73,18 @@ def evaluate_window(
         mine = Gathered(gathered.information[t, 0], gathered.gradient[t])
         forward(theta[t], model.body, own, scratch)
         joint_motions(own, motions[t])
-        if weights.position > 0.0:
+        mine_counts = t < owned
+        if weights.position > 0.0 and mine_counts:
             cost += add_position(
                 weights.position, model.landmarks, window.keypoints[t], own, scratch, mine
             )
-        if weights.orientation > 0.0:
+        if weights.orientation > 0.0 and mine_counts:
             cost += add_orientation(
                 weights.orientation, sensors, window.rotation[t], window.present[t], own, mine
             )
-        if weights.floor > 0.0:
+        if weights.floor > 0.0 and mine_counts:
             cost += add_floor(weights.floor, model.floor, own, scratch, mine)
-        if weights.increment > 0.0 and t > 0:
+        if weights.increment > 0.0 and 0 < t <= owned:
             cost += add_increment(
                 weights.increment,
                 sensors,
@@ -92,7 +97,21 @@ def evaluate_window(
                 gathered.information[t, 1],
                 square,
             )
-        if t < 2:
+        if weights.rest > 0.0 and 0 < t <= owned:
+            cost += add_rest(
+                weights.rest,
+                model.floor,
+                window.contact[t],
+                window.steps[t - 1],
+                Posed(
+                    posed.position[t - 1 : t + 1],
+                    posed.rotation[t - 1 : t + 1],
+                    posed.twist[t - 1 : t + 1],
+                ),
+                lever,
+                Gathered(gathered.information[t - 1 : t + 1], gathered.gradient[t - 1 : t + 1]),
+            )
+        if t < 2 or t - 2 >= owned:
             continue
         first, end = t - 2, t + 1
         if weights.specific_force > 0.0:
@@ -135,12 +154,12 @@ def evaluate_window(
             hessian_out[t, 0],
             gradient_out[t],
         )
-        if weights.projection > 0.0:
+        if weights.projection > 0.0 and t < owned:
             cost += add_prior(
                 weights.projection, prior.mean, prior.projector, theta[t], hessian_out[t, 0],
                 gradient_out[t],
             )  # fmt: skip
-        if weights.deviation > 0.0:
+        if weights.deviation > 0.0 and t < owned:
             cost += add_prior(
                 weights.deviation, prior.mean, prior.precision, theta[t], hessian_out[t, 0],
                 gradient_out[t],
@@ -148,17 +167,32 @@ def evaluate_window(
     return cost
 
 
-@kernel("void(f8[:, :, :, ::1], f8, f8[:, ::1])")
-def banded(hessian, damping, band_out):
-    """Lower band (N P, 3 P): band_out[column, row - column]; the diagonal damped."""
-    count, size = hessian.shape[0], hessian.shape[2]
-    band_out[:] = 0.0
-    for t in range(count):
-        for k in range(min(t, 2) + 1):
-            block = hessian[t, k]
-            for i in range(size):
-                for j in range(i + 1 if k == 0 else size):
-                    band_out[(t - k) * size + j, k * size + i - j] = block[i, j]
+@kernel("f8(f8[:, :, :, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, :, ::1], f8[:, ::1])")
+def add_folded(information, slope, where, theta, hessian_out, gradient_out):
+    """½ dᵀ H d + gᵀ d of the two oldest instants, d = theta - where (2, P).
+
+    information (2, 3, P, P) as `evaluate_window` gives H, slope (2, P) its gradient at `where`.
+    """
+    size = theta.shape[1]
+    cost = 0.0
+    for t in range(2):
         for i in range(size):
-            d = hessian[t, 0, i, i]
-            band_out[t * size + i, 0] += damping * max(d, 1e-6) + 1e-12
+            d = theta[t, i] - where[t, i]
+            pull = 0.0
+            for j in range(size):
+                value = information[t, 0, i, j] if j <= i else information[t, 0, j, i]
+                pull += value * (theta[t, j] - where[t, j])
+                hessian_out[t, 0, i, j] += information[t, 0, i, j]
+            cost += d * (0.5 * pull + slope[t, i])
+            gradient_out[t, i] += pull + slope[t, i]
+    for i in range(size):
+        d = theta[1, i] - where[1, i]
+        pull = 0.0
+        for j in range(size):
+            value = information[1, 1, i, j]
+            pull += value * (theta[0, j] - where[0, j])
+            hessian_out[1, 1, i, j] += value
+            gradient_out[0, j] += value * d
+        cost += d * pull
+        gradient_out[1, i] += pull
+    return cost

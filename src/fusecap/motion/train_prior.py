@@ -23,6 +23,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.cluster.vq import vq
+from scipy.signal import butter, sosfiltfilt
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from fusecap.body.prior import PosePrior
@@ -70,6 +72,11 @@ _WITHIN_SHARE = 0.95
 _HELD_OUT_EVERY = 5
 """Where no pattern matches a key, every fifth take is held out."""
 
+_CUTOFF_HZ = 8.0
+_ACCELERATION_SHARE = 0.98
+"""Of frames whose accelerations are usual; beyond, markers were swapped."""
+_SHORTEST_TAKE = 30
+"""Frames from which accelerations are taken."""
 _MAX_ANGLE_DEG = {"upper_arm": 160.0, "forearm": 155.0, "hand": 100.0}
 
 
@@ -186,13 +193,22 @@ def train_prior(
         "kept_variance": _KEPT_VARIANCE,
         "mirrored": mirror,
         "max_angle_deg": _MAX_ANGLE_DEG,
+        "acceleration_share": _ACCELERATION_SHARE,
+        "acceleration_cutoff_hz": _CUTOFF_HZ,
         "seed": seed,
         "training_takes": [take.key for take in training],
         "held_out_patterns": list(held_out),
         "report": asdict(report),
     }
     prior = PosePrior(
-        skeleton_name=skeleton.name, mean=mean, basis=basis, sigma=sigma, recipe=recipe
+        skeleton_name=skeleton.name,
+        mean=mean,
+        basis=basis,
+        sigma=sigma,
+        acceleration=_typical_acceleration(
+            skeleton, np.concatenate([take.acceleration for take in training])
+        ),
+        recipe=recipe,
     )
     return prior, report
 
@@ -205,11 +221,7 @@ def max_angles_rad(skeleton: Skeleton) -> Float[np.ndarray, " b"]:
 
 def mirrored(skeleton: Skeleton, poses: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
     """The poses (`theta[6:]`) as a mirror would show them, left and right exchanged."""
-    swap = {"left": "right", "right": "left"}
-    order = []
-    for name in skeleton.bone_names[1:]:
-        side, _, part = name.partition("_")
-        order.append(skeleton.bone(f"{swap[side]}_{part}" if side in swap else name) - 1)
+    order = [bone - 1 for bone in _other_side(skeleton)[1:]]
     vectors = poses.reshape(len(poses), -1, 3)[:, order] * [1.0, -1.0, -1.0]
     return vectors.reshape(poses.shape)
 
@@ -219,6 +231,8 @@ class _Take:
     key: str
     poses: Float[np.ndarray, "n d"]
     """`theta[6:]` at 60 Hz, frames beyond human range left out."""
+    acceleration: Float[np.ndarray, "m n"]
+    """(m, 1 + B) magnitudes: of the root's place [m/s²], of every joint [rad/s²]."""
     dropped: int
     path_m: Float[np.ndarray, "t 3"]
     """Of the root in the file's own world, to recognise a take in another format."""
@@ -228,16 +242,58 @@ class _Take:
 
 def _prepare(key: str, motion: Motion, skeleton: Skeleton) -> _Take:
     slower = motion[:: max(1, round(motion.rate_hz / _RATE_HZ))]
-    poses = retarget(slower, skeleton)[:, 6:]
+    theta = retarget(slower, skeleton)
+    poses = theta[:, 6:]
     angles = np.linalg.norm(poses.reshape(len(poses), -1, 3), axis=-1)
     possible = np.all(angles <= max_angles_rad(skeleton), axis=1)
     return _Take(
         key=key,
         poses=poses[possible],
+        acceleration=_accelerations(theta, slower.rate_hz),
         dropped=int(np.sum(~possible)),
         path_m=motion.root_position_m,
         keys=(key,),
     )
+
+
+def _accelerations(theta: Float[np.ndarray, "t p"], rate_hz: float) -> Float[np.ndarray, "m n"]:
+    """Magnitudes between the first and the last instant, as the motion term sees them.
+
+    Of what is slower than 8 Hz, as people move: the rest is the markers' noise.
+    """
+    count, bones = len(theta), theta.shape[1] // 3 - 1
+    if count < _SHORTEST_TAKE:
+        return np.empty((0, 1 + bones))
+    turns = Rotation.from_rotvec(theta[:-1, 3:].reshape(-1, 3)).inv()
+    turns *= Rotation.from_rotvec(theta[1:, 3:].reshape(-1, 3))
+    joints = turns.as_rotvec().reshape(count - 1, bones, 3)
+    velocity = np.concatenate([np.diff(theta[:, None, :3], axis=0), joints], axis=1) * rate_hz
+    slow = sosfiltfilt(butter(2, _CUTOFF_HZ, fs=rate_hz, output="sos"), velocity, axis=0)
+    return np.linalg.norm(np.diff(slow, axis=0), axis=2) * rate_hz
+
+
+def _typical_acceleration(
+    skeleton: Skeleton, accelerations: Float[np.ndarray, "m n"]
+) -> Float[np.ndarray, " n"]:
+    """(1 + B,) root mean squares without the largest, left and right alike.
+
+    Bones that never move in the takes count as the calmest of the others.
+    """
+    usual = [one[one <= np.quantile(one, _ACCELERATION_SHARE)] for one in accelerations.T]
+    typical = np.array([np.square(one).mean() for one in usual])
+    typical = np.maximum(typical, typical[typical > 1e-9 * typical.max()].min())
+    other = [0, *(1 + bone for bone in _other_side(skeleton))]
+    return np.sqrt(0.5 * (typical + typical[other]))
+
+
+def _other_side(skeleton: Skeleton) -> list[int]:
+    """Per bone its mirror image."""
+    swap = {"left": "right", "right": "left"}
+    bones = []
+    for name in skeleton.bone_names:
+        side, _, part = name.partition("_")
+        bones.append(skeleton.bone(f"{swap[side]}_{part}" if side in swap else name))
+    return bones
 
 
 def _without_duplicates(takes: Sequence[_Take]) -> tuple[list[_Take], tuple[str, ...]]:
@@ -250,6 +306,7 @@ def _without_duplicates(takes: Sequence[_Take]) -> tuple[list[_Take], tuple[str,
                 kept[index] = _Take(
                     key=other.key,
                     poses=other.poses,
+                    acceleration=other.acceleration,
                     dropped=other.dropped,
                     path_m=other.path_m,
                     keys=(*other.keys, take.key),

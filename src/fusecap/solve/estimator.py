@@ -1,6 +1,7 @@
-"""One subject's motion over time: initialise, warm-start, predict, recover.
+"""One subject's motion over time: initialise, warm-start, solve with the instants before, recover.
 
-    update(observation) -> Estimate        one solve per instant, warm-started by the previous pose
+    update(observation) -> Estimate        the newest instant, first alone, then in its window
+    settled(lag_s)      -> Estimate        an instant of the window, as what came since corrects it
 
 Time is an argument; an `Estimator` holds no clock or thread, so a recording replays bit for bit and
 several subjects can be updated on threads.
@@ -9,6 +10,7 @@ several subjects can be updated on threads.
 from __future__ import annotations
 
 import time
+from collections import deque
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -29,7 +31,8 @@ from fusecap.solve.initialize import (
 )
 from fusecap.solve.options import SolverOptions
 from fusecap.solve.pose_solver import ImuSites, Measurements, PoseSolver, Solution
-from fusecap.types import Estimate, Observation
+from fusecap.solve.window_solver import WindowSolver
+from fusecap.types import Estimate, Observation, Status
 
 _DEFAULT_HEIGHT_M = 1.72
 """Of a person nobody has measured yet."""
@@ -39,6 +42,10 @@ off (s = 1 at λ = 1e-3 and full confidence) in a 1920-pixel-wide image."""
 _RESTART_INTERVAL_S = 0.25
 _MAX_PREDICTION_S = 0.2
 _RESTART_AFTER_NS = 1_000_000_000
+_LOST_FACTOR = 2.0
+"""Of the cost of an instant alone, or a poor one: beyond it a motion has gone astray."""
+_MAX_STEPS = 3
+"""Of the window at a new instant; one or two are enough nearly always."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,6 +90,10 @@ class Estimator:
             options=options,
         )
         self._landmark_bones = landmarks.bones(skeleton)
+        together = self.solver.options.together
+        self._motion = WindowSolver(self.solver, self.solver.options.window) if together else None
+        self._recent: deque[Estimate] = deque(maxlen=self.solver.options.window)
+        """Those of the instants in the window, as they were when new."""
         self._solution: Solution | None = None
         self._previous: Observation | None = None
         self._sites: list[np.ndarray] = []
@@ -108,6 +119,7 @@ class Estimator:
             self._previous = None
             self._sites = []
             self._points = []
+            self._begin_motion()
         return self.update(observation, landmarks_in_world_m)
 
     def set_shape(self, shape: BodyShape) -> None:
@@ -151,15 +163,70 @@ class Estimator:
         if self._solution is None:
             solution = self._first(observation, data, landmarks_in_world_m)
         elif views.any() or has_imu:
-            solution = self.solver.solve(self._solution.theta, data)
-            solution = self._better_start(observation, data, landmarks_in_world_m, solution)
+            data = self._weighed(data, self._solution.theta)
+            near = self.solver.solve(self._solution.theta, data)
+            solution = self._better_start(observation, data, landmarks_in_world_m, near)
+            if solution is not near:
+                self._begin_motion()
         else:
             return self._held(observation.timestamp_ns, self._solution, views)
         if solution is None:
             return None
+        sound = solution.status is not Status.DIVERGED
+        if self._motion is not None and sound:
+            solution = self._in_window(self._motion, observation, data, solution)
         solve_s = time.perf_counter() - started
         self._remember(observation, solution)
-        return self._estimate(observation.timestamp_ns, solution, views, solve_s)
+        estimate = self._estimate(observation.timestamp_ns, solution, views, solve_s)
+        if sound:
+            self._recent.append(estimate)
+        return estimate
+
+    def settled(self, lag_s: float) -> Estimate | None:
+        """The newest instant at least `lag_s` old, corrected by what was measured since.
+
+        None while the window holds none that is so old; one of less than `lag_s` settles as much
+        as it can.
+        """
+        if self._motion is None or not self._motion.count:
+            return None
+        back = self._motion.back(lag_s)
+        if back is None or back >= len(self._recent):
+            return None
+        then = self._recent[-1 - back]
+        theta = self._motion.pose(back)
+        position, rotation = self.solver.posed(theta)
+        return replace(
+            then, theta=theta, bone_position_in_world_m=position, bone_rotation_in_world=rotation
+        )
+
+    def _in_window(
+        self,
+        motion: WindowSolver,
+        observation: Observation,
+        data: Measurements,
+        alone: Solution,
+    ) -> Solution:
+        """The instant together with those before it; alone where the motion has lost the person."""
+        if not motion.goes_on(observation.timestamp_ns):
+            self._begin_motion()
+        motion.push(observation, alone.theta)
+        motion.refine(_MAX_STEPS)
+        theta = motion.pose()
+        seen = np.count_nonzero(observation.keypoints[:, :, 2] > 0)
+        allowed = _LOST_FACTOR * max(alone.cost, _POOR_COST_PER_KEYPOINT * max(seen, 1))
+        if not self.solver.cost(theta, data) < allowed:
+            self._begin_motion()
+            motion.push(observation, alone.theta)
+            return alone
+        position, rotation = self.solver.posed(theta)
+        return replace(alone, theta=theta, position_in_world_m=position, rotation_in_world=rotation)
+
+    def _begin_motion(self) -> None:
+        """Forget how the person moved so far."""
+        self._recent.clear()
+        if self._motion is not None:
+            self._motion.reset()
 
     def _first(
         self, observation: Observation, data: Measurements, points: np.ndarray
@@ -183,7 +250,7 @@ class Estimator:
                 ]
         else:
             starts = poses_from_one_view(shape, prior, self._rig, observation.keypoints)
-        solutions = [self.solver.solve(start, data) for start in starts]
+        solutions = [self.solver.solve(start, self._weighed(data, start)) for start in starts]
         self._last_start_ns = observation.timestamp_ns
         return min(solutions, key=lambda s: s.cost) if solutions else None
 
@@ -217,6 +284,9 @@ class Estimator:
         shape = self._measure.shape()
         if shape is not None and shape is not self.shape:
             self.solver.set_shape(shape)
+
+    def _weighed(self, data: Measurements, theta: np.ndarray) -> Measurements:
+        return replace(data, keypoints=self.solver.weighed(data.keypoints, theta[:3]))
 
     def _measurements(self, observation: Observation) -> Measurements:
         count = len(self.model.sites.bone)

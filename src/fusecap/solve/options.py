@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 from fusecap.errors import InputError, nearest
 
-SMOOTH = {"motion": 1.0, "increment": 1100.0, "specific_force": 0.01}
-"""Weights that make a motion of poses: one sigma is 0.03 rad of a sensor's turn, and 10 m/s² of its
-specific force, as flesh and straps give."""
-ROOT_NOISE_M_S2 = 30.0
-JOINT_NOISE_RAD_S2 = 120.0
-"""How fast velocities of the root and of joints change in ordinary motion: one sigma."""
+BETWEEN = ("motion", "increment", "specific_force", "rest")
+"""Terms that couple instants."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,26 +21,35 @@ class Weights:
     the prior outweighs the sensors; how that was chosen is in docs/accuracy.md.
     """
 
-    position: float = 1e-3
-    """Per px² of a 1920-pixel-wide image, times the keypoint's confidence."""
-    orientation: float = 20.0
+    position: float = 2e-3
+    """Per px² of a 1920-pixel-wide image, times the keypoint's confidence, of somebody small in it;
+    see `growth`. The paper's value is 1e-3."""
+    growth: float = 2e-5
+    """Per (px/m)², not a term: a keypoint's variance is 1 + growth ρ² times that of somebody small,
+    where the image shows a metre as ρ pixels. With it a keypoint counts as the paper's where
+    somebody is as large as in its studio (ρ = 220)."""
+    orientation: float = 10.0
     """Per sin²(φ/2); the paper's value is 1. A sensor that is 6 deg off then costs what a pose one
     standard deviation from the prior's mean does: λ φ²/4 = 0.06 at φ = 0.11 rad."""
     acceleration: float = 0.0
     """Per (m/s²)²; the paper's value is 1e-3."""
-    projection: float = 0.7
+    projection: float = 2.8
     """Per rad² outside the PCA subspace."""
-    deviation: float = 0.06
+    deviation: float = 0.03
     """Per squared standard deviation within it."""
     floor: float = 10.0
     """Per m² below the floor."""
-    motion: float = 0.0
-    """Between instants: of a change of velocity, per squared process noise (`ROOT_NOISE_M_S2`,
-    `JOINT_NOISE_RAD_S2`)."""
-    increment: float = 0.0
-    """Between instants: per rad² between a bone's turn and its sensor's."""
-    specific_force: float = 0.0
-    """Between instants: per (m/s²)² between what a sensor would feel and felt."""
+    motion: float = 0.04
+    """Between instants: of a change of velocity, per squared `PosePrior.acceleration`; one sigma is
+    five times that of ordinary motion."""
+    increment: float = 1100.0
+    """Between instants: per rad² between a bone's turn and its sensor's; one sigma is 0.03 rad."""
+    specific_force: float = 0.006
+    """Between instants: per (m/s²)² between what a sensor would feel and felt; one sigma is 13
+    m/s², for flesh and straps give."""
+    rest: float = 6.0
+    """Between instants: per (m/s)² of a foot that stands (where `floor` is on) or of a root that
+    nothing places; one sigma is 0.4 m/s at an instant, for a foot that rolls does move."""
 
     def __post_init__(self) -> None:
         for term in fields(self):
@@ -63,13 +68,20 @@ class Weights:
 
     @classmethod
     def paper(cls) -> Weights:
-        """All terms as printed."""
-        return cls(orientation=1.0, acceleration=1e-3)
+        """All terms as printed, and none between instants."""
+        return cls(
+            position=1e-3, growth=0.0, orientation=1.0, acceleration=1e-3, projection=0.7,
+            deviation=0.06,
+        ).alone()  # fmt: skip
+
+    def alone(self) -> Weights:
+        """Without the terms between instants: each is solved alone."""
+        return replace(self, **dict.fromkeys(BETWEEN, 0.0))
 
     @property
     def between_instants(self) -> bool:
         """Whether any term couples instants: else each is solved alone."""
-        return max(self.motion, self.increment, self.specific_force) > 0.0
+        return any(getattr(self, name) > 0.0 for name in BETWEEN)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,6 +93,8 @@ class SolverOptions:
     function_tolerance: float = 1e-4
     """Stop when a step lowers the cost, or promises to, by less than this share of it."""
     initial_damping: float = 1e-2
+    window: int = 10
+    """Instants that a live pose is solved together with, itself among them; 1: each alone."""
     floor_radius_m: float = 0.05
     """Distance kept between the floor and the ankle and toe joints [1, eq. 16]."""
     quality: bool = True
@@ -89,5 +103,12 @@ class SolverOptions:
     def __post_init__(self) -> None:
         if self.max_iterations < 1:
             raise InputError(f"max_iterations is {self.max_iterations}; expected at least 1")
+        if not (self.window == 1 or 3 <= self.window <= 1000):
+            raise InputError(f"window is {self.window}; expected 3-1000 instants, or 1")
         if not 0 < self.function_tolerance < 1:
             raise InputError(f"function_tolerance is {self.function_tolerance}; expected 0-1")
+
+    @property
+    def together(self) -> bool:
+        """Whether instants are solved together."""
+        return self.window > 1 and self.weights.between_instants

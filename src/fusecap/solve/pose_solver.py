@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.body.prior import PosePrior
@@ -15,11 +14,12 @@ from fusecap.errors import InputError
 from fusecap.geometry.camera import Rig
 from fusecap.kernels import cholesky, groups
 from fusecap.kernels import solve as kernels
-from fusecap.solve.options import JOINT_NOISE_RAD_S2, ROOT_NOISE_M_S2, SolverOptions
-from fusecap.types import GRAVITY_M_S2, Observation, Status
+from fusecap.kernels.kinematics import forward
+from fusecap.solve.options import SolverOptions
+from fusecap.types import Status
 
 _FLOOR_BONES = ("left_foot", "left_toes", "right_foot", "right_toes")
-_UP_M_S2 = np.array([0.0, GRAVITY_M_S2, 0.0])
+_NEAR_M = 0.5
 _ROOT_PRIOR_VARIANCE = np.pi**2
 """Per axis [rad²], of a root that could face anywhere: what its quality is measured against."""
 
@@ -101,9 +101,12 @@ class PoseSolver:
         self._prior = groups.Prior(
             mean=prior.mean, projector=prior.projector, precision=prior.precision
         )
+        self._acceleration = prior.acceleration
+        feet = [skeleton.bone(name) for name in _FLOOR_BONES]
         self._floor = groups.Floor(
-            bone=np.array([skeleton.bone(name) for name in _FLOOR_BONES], dtype=np.int64),
+            bone=np.array(feet, dtype=np.int64),
             radius=self.options.floor_radius_m,
+            resting=np.array([*feet, 0], dtype=np.int64),
         )
         self._prior_variance = self._variance_under_prior(prior)
         n, b = skeleton.pose_size, skeleton.bone_count
@@ -175,11 +178,16 @@ class PoseSolver:
             cost=cost,
         )
 
-    def evaluate(
-        self, theta: Float[np.ndarray, " p"], data: Measurements
-    ) -> tuple[float, Float[np.ndarray, " p"], Float[np.ndarray, "p p"]]:
-        """Cost, gradient and Gauss-Newton matrix at `theta`, for checks and for other solvers."""
-        cost = kernels.evaluate(
+    def posed(
+        self, theta: Float[np.ndarray, " p"]
+    ) -> tuple[Float[np.ndarray, "b 3"], Float[np.ndarray, "b 3 3"]]:
+        """Joint positions [m] and rotations in the world."""
+        forward(theta, self.model.body, self._posed, self._scratch)
+        return self._posed.position.copy(), self._posed.rotation.copy()
+
+    def cost(self, theta: Float[np.ndarray, " p"], data: Measurements) -> float:
+        """Of a pose at this instant alone."""
+        return kernels.evaluate(
             np.ascontiguousarray(theta, dtype=np.float64),
             self.model,
             self._measured(data),
@@ -189,6 +197,12 @@ class PoseSolver:
             self._hessian[0],
             self._gradient[0],
         )
+
+    def evaluate(
+        self, theta: Float[np.ndarray, " p"], data: Measurements
+    ) -> tuple[float, Float[np.ndarray, " p"], Float[np.ndarray, "p p"]]:
+        """Cost, gradient and Gauss-Newton matrix at `theta`, for checks and for other solvers."""
+        cost = self.cost(theta, data)
         lower = np.tril(self._hessian[0])
         return cost, self._gradient[0].copy(), lower + np.tril(lower, -1).T
 
@@ -210,28 +224,32 @@ class PoseSolver:
             dt=data.dt_s,
         )
 
-    def window(
-        self, times_ns: Int[np.ndarray, " n"], observations: Sequence[Observation]
-    ) -> groups.Window:
-        """What `kernels.window` takes of these instants."""
-        shape = (len(observations), len(self.sites.bone))
-        rotation = np.full((*shape, 3, 3), np.nan)
-        force = np.full((*shape, 3), np.nan)
-        for t, one in enumerate(observations):
-            if one.imu is not None:
-                rotation[t] = one.imu.bone_rotation_in_world
-                felt_in_world = one.imu.accel_in_world_m_s2 + _UP_M_S2
-                force[t] = np.einsum("iab,ia->ib", rotation[t], felt_in_world)
-        noise = np.full(1 + self.skeleton.bone_count, JOINT_NOISE_RAD_S2)
-        noise[0] = ROOT_NOISE_M_S2
-        return groups.Window(
-            keypoints=np.stack([one.keypoints for one in observations]),
-            rotation=rotation,
-            present=np.isfinite(rotation[:, :, 0, 0]).astype(np.float64),
-            force=force,
-            steps=np.diff(times_ns) * 1e-9,
-            steadiness=noise**-2.0,
-        )
+    def weighed(
+        self, keypoints: Float[np.ndarray, "c k 3"], root_m: Float[np.ndarray, "3"]
+    ) -> Float[np.ndarray, "c k 3"]:
+        """Keypoints of somebody about there, with confidences less where the image is large.
+
+        By `Weights.growth`; a camera that somebody stands behind keeps its own.
+        """
+        rig, growth = self._rig, self.options.weights.growth
+        if not growth or not len(rig):
+            return keypoints
+        depth_m = rig[:, 6:9] @ root_m + rig[:, 11]
+        px_per_m = rig[:, 21] * rig[:, 12] / np.maximum(depth_m, _NEAR_M)
+        share = np.where(depth_m > _NEAR_M, 1.0 / (1.0 + growth * px_per_m**2), 1.0)
+        weighed = keypoints.copy()
+        weighed[:, :, 2] *= share[:, None]
+        return weighed
+
+    @property
+    def view_shape(self) -> tuple[int, int]:
+        """How many cameras and landmarks keypoints come from."""
+        return len(self._rig), len(self._landmark_bone)
+
+    @property
+    def steadiness(self) -> Float[np.ndarray, " n"]:
+        """(1 + B,) of the root's place and every joint: one over their mean square acceleration."""
+        return self._acceleration**-2.0
 
     def _quality(self) -> np.ndarray:
         """1 - posterior / prior variance per bone, from the Gauss-Newton matrix at the solution."""

@@ -1,160 +1,234 @@
 """Motion instead of poses: the cost of one body over many instants, minimised together.
 
 The front of `fusecap.kernels.window`. Instants are coupled three by three, so the normal equations
-are a band that LAPACK factors in time linear in the number of instants. Long takes are solved in
-pieces that overlap: each holds the last two poses of the piece before it, and looks `AHEAD`
-instants beyond what it keeps, so what a solver holds does not grow and nothing jumps between
-pieces.
+are solved in time linear in the number of instants. A window holds a few of
+them; those that leave are folded into what they say about the two oldest that stay, so that nothing
+measured is forgotten, nor held.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import pairwise
-
 import numpy as np
-from jaxtyping import Float, Int
-from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
+from jaxtyping import Float
 
-from fusecap.kernels import groups, window
+from fusecap.body.skeleton import Skeleton
+from fusecap.kernels import band, groups, window
 from fusecap.kernels.jit import FINITE
 from fusecap.kernels.lie import wrap_pose
+from fusecap.solve.contact import Contact
 from fusecap.solve.pose_solver import PoseSolver
-from fusecap.types import Observation
+from fusecap.types import GRAVITY_M_S2, Observation
 
-PIECE = 120
-AHEAD = 30
-"""Half a second at 60 Hz; pieces then differ from the whole by under a millimetre (tests)."""
 LONGEST_STEP_S = 0.1
 """Longer gaps are not bridged: the motion ends and begins anew."""
-_HELD_INFORMATION = 1e12
+EXACT_S = 1e-3
+"""Within which an instant is as old as asked for: clocks round."""
+_DAMPING, _LEAST_DAMPING, _MAX_DAMPING = 1e-4, 1e-8, 1e6
+_KEPT_PROMISE = 0.5
+"""Of two steps that were needed, nearly all have a first one farther than this from its promise."""
+_UP_M_S2 = np.array([0.0, GRAVITY_M_S2, 0.0])
+_RIDGE = 1e-9
 
 
-class WindowSolver:
-    """Minimises over consecutive poses of the subject of a `PoseSolver`."""
+class Workspace:
+    """Where a window of up to `size` instants is computed; windows that take turns may share it."""
 
-    def __init__(self, solver: PoseSolver) -> None:
-        self._solver = solver
-        b, p, n = solver.skeleton.bone_count, solver.skeleton.pose_size, PIECE + AHEAD + 2
-        self._posed = (np.zeros((n, b, 3)), np.zeros((n, b, 3, 3)), np.zeros((n, b, 3, 3)))
-        self._gathered = (np.zeros((n, 3, b, 6, 6)), np.zeros((n, b, 6)))
-        self._scratch = groups.Scratch(
+    def __init__(self, skeleton: Skeleton, size: int) -> None:
+        b, p, n = skeleton.bone_count, skeleton.pose_size, size
+        self.trial, self.step = np.zeros((n, p)), np.zeros((n, p))
+        self.posed = (np.zeros((n, b, 3)), np.zeros((n, b, 3, 3)), np.zeros((n, b, 3, 3)))
+        self.gathered = (np.zeros((n, 3, b, 6, 6)), np.zeros((n, b, 6)))
+        self.scratch = groups.Scratch(
             local=np.zeros((3, 3)),
             information=np.zeros((3, 3)),
             gradient=np.zeros(3),
             motion=np.zeros((b, 6, 3)),
             force=np.zeros((6, 3)),
         )
-        self._motions = np.zeros((n, b, 6, 3))
-        self._lever, self._square = np.zeros((3, 3, 6)), np.zeros((10, 3, 3))
-        self._normal = [(np.zeros((n, 3, p, p)), np.zeros((n, p))) for _ in range(2)]
-        self._band = np.zeros((n * p, 3 * p))
+        self.motions = np.zeros((n, b, 6, 3))
+        self.lever, self.square = np.zeros((3, 3, 6)), np.zeros((10, 3, 3))
+        self.hessian, self.gradient = np.zeros((n, 3, p, p)), np.zeros((n, p))
 
-    def smooth(
-        self,
-        theta: Float[np.ndarray, "t p"],
-        observations: Sequence[Observation],
-    ) -> Float[np.ndarray, "t p"]:
-        """The motion nearest to all measurements, from poses solved one by one.
 
-        Each stretch without a gap of more than `LONGEST_STEP_S` is a motion of its own; one of one
-        or two poses has no neighbours to learn from and stays. Never worse in cost than `theta`.
-        """
-        times_ns = np.array([one.timestamp_ns for one in observations], dtype=np.int64)
-        cuts = np.flatnonzero(np.diff(times_ns) > LONGEST_STEP_S * 1e9) + 1
-        smoothed = np.array(theta, dtype=np.float64)
-        for first, end in pairwise([0, *cuts.tolist(), len(times_ns)]):
-            if end - first > 2:
-                self._smooth_stretch(
-                    smoothed[first:end], times_ns[first:end], observations[first:end]
-                )
-        for pose in smoothed:
-            wrap_pose(pose)
-        return smoothed
+class WindowSolver:
+    """The latest instants of the subject of a `PoseSolver`; allocates little but results."""
 
-    def _smooth_stretch(
-        self,
-        theta: Float[np.ndarray, "t p"],
-        times_ns: Int[np.ndarray, " t"],
-        observations: Sequence[Observation],
-    ) -> None:
-        kept = 0
-        while kept < len(theta):
-            first = max(kept - 2, 0)
-            end = min(kept + PIECE + AHEAD, len(theta))
-            last = end if end == len(theta) else kept + PIECE
-            piece = slice(first, end)
-            solved = self._minimise(
-                np.ascontiguousarray(theta[piece]),
-                times_ns[piece],
-                observations[first:end],
-                held=kept - first,
-            )
-            theta[kept:last] = solved[kept - first : last - first]
-            kept = last
-
-    def _minimise(
-        self,
-        theta: Float[np.ndarray, "n p"],
-        times_ns: Int[np.ndarray, " n"],
-        observations: Sequence[Observation],
-        *,
-        held: int,
-    ) -> Float[np.ndarray, "n p"]:
-        """Levenberg-Marquardt over one piece, whose first `held` poses stay."""
-        options = self._solver.options
-        measured = self._solver.window(times_ns, observations)
-        n, p = theta.shape
-        band = self._band[: n * p]
-        (hessian, gradient), (other_hessian, other_gradient) = (
-            (h[:n], g[:n]) for h, g in self._normal
+    def __init__(self, solver: PoseSolver, size: int, workspace: Workspace | None = None) -> None:
+        """A window of up to `size` instants, three at least."""
+        self._solver = solver
+        cameras, landmarks = solver.view_shape
+        sensors = len(solver.sites.bone)
+        self.size = size
+        self.count = 0
+        self._times_ns = np.zeros(size, dtype=np.int64)
+        self._theta = np.zeros((size, solver.skeleton.pose_size))
+        self._measured = groups.Window(
+            keypoints=np.zeros((size, cameras, landmarks, 3)),
+            rotation=np.zeros((size, sensors, 3, 3)),
+            present=np.zeros((size, sensors)),
+            force=np.zeros((size, sensors, 3)),
+            contact=np.zeros((size, len(solver.model.floor.resting))),
+            steps=np.zeros(size - 1),
+            steadiness=solver.steadiness,
         )
-        cost = self._evaluate(theta, measured, hessian, gradient)
-        damping = options.initial_damping**2
-        for _ in range(options.max_iterations):
-            if not cost < FINITE or damping > 1e6:
+        self._workspace = workspace or Workspace(solver.skeleton, size)
+        self._feet_m = np.zeros((size, len(solver.model.floor.bone), 3))
+        """Floor joints of each instant alone."""
+        self._contact = Contact(
+            solver.model.floor,
+            solver.skeleton.parent_array,
+            solver.sites,
+            has_floor=solver.options.weights.floor > 0.0,
+        )
+        self._prior: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+        """What those that left say of the two oldest: H (2, 3, P, P), g (2, P), both at (2, P)."""
+
+    @property
+    def pose_size(self) -> int:
+        """P."""
+        return self._theta.shape[1]
+
+    def reset(self) -> None:
+        """Forget everything; the next instant begins a motion."""
+        self.count = 0
+        self._prior = None
+
+    def goes_on(self, timestamp_ns: int) -> bool:
+        """Whether an instant follows the newest without a gap."""
+        if not self.count:
+            return False
+        step_s = (timestamp_ns - self._times_ns[self.count - 1].item()) * 1e-9
+        return 0.0 < step_s <= LONGEST_STEP_S
+
+    def push(self, observation: Observation, theta: Float[np.ndarray, " p"]) -> None:
+        """One more instant, which begins at `theta`; the oldest leaves where there is no room."""
+        if not self.goes_on(observation.timestamp_ns):
+            self.reset()
+        if self.count == self.size:
+            self.fold(1)
+        row, measured = self.count, self._measured
+        self._times_ns[row] = observation.timestamp_ns
+        self._theta[row] = theta
+        measured.keypoints[row] = self._solver.weighed(observation.keypoints, theta[:3])
+        measured.rotation[row] = np.nan
+        measured.force[row] = np.nan
+        if observation.imu is not None:
+            rotation = observation.imu.bone_rotation_in_world
+            felt_in_world = observation.imu.accel_in_world_m_s2 + _UP_M_S2
+            measured.rotation[row] = rotation
+            measured.force[row] = np.einsum("iab,ia->ib", rotation, felt_in_world)
+        measured.present[row] = np.isfinite(measured.rotation[row, :, 0, 0])
+        if row:
+            measured.steps[row - 1] = (self._times_ns[row] - self._times_ns[row - 1]) * 1e-9
+        self._feet_m[row] = self._solver.posed(theta)[0][self._solver.model.floor.bone]
+        measured.contact[row] = self._contact.at(row, measured, self._feet_m)
+        self.count += 1
+
+    def refine(self, max_iterations: int, tolerance: float | None = None) -> None:
+        """Levenberg-Marquardt from where the poses are; never makes their cost worse.
+
+        Ends when a step lowers the cost by less than the share `tolerance`; without one, after the
+        first step that does nearly what the quadratic model promises: then the new instant's start
+        was near, and those before it were solved long ago.
+        """
+        workspace, n = self._workspace, self.count
+        theta, trial, step = self._theta[:n], workspace.trial[:n], workspace.step[:n]
+        hessian, gradient = workspace.hessian[:n], workspace.gradient[:n]
+        cost = self._evaluate(theta)
+        damping = _DAMPING
+        for _ in range(max_iterations):
+            if not cost < FINITE or damping > _MAX_DAMPING:
                 break
-            window.banded(hessian, damping, band)
-            band[: held * p, 0] += _HELD_INFORMATION
-            try:
-                factor = cholesky_banded(band.T, overwrite_ab=True, lower=True, check_finite=False)
-            except LinAlgError:
-                damping *= 10.0
-                continue
-            step = cho_solve_banded((factor, True), -gradient.ravel(), check_finite=False)
-            step = step.reshape(n, p)
-            step[:held] = 0.0
-            trial = theta + step
-            trial_cost = self._evaluate(trial, measured, other_hessian, other_gradient)
+            positive = band.eliminate(hessian, gradient, n, damping, _RIDGE, workspace.square[0])
+            promised = 0.5 * float(np.vdot(gradient, gradient))
+            trial_cost = np.inf
+            if positive:
+                band.step_of(hessian, gradient, step)
+                np.add(theta, step, out=trial)
+                trial_cost = self._evaluate(trial)
             if not trial_cost < cost:
                 damping *= 10.0
+                cost = self._evaluate(theta)
                 continue
-            converged = cost - trial_cost <= 0.1 * options.function_tolerance * cost
-            theta, cost, damping = trial, trial_cost, max(damping / 10.0, 1e-8)
-            hessian, other_hessian = other_hessian, hessian
-            gradient, other_gradient = other_gradient, gradient
-            if converged:
+            decrease = cost - trial_cost
+            theta[:] = trial
+            if tolerance is None:
+                done = abs(decrease - promised) < _KEPT_PROMISE * promised
+            else:
+                done = decrease <= tolerance * cost
+            cost, damping = trial_cost, max(damping / 10.0, _LEAST_DAMPING)
+            if done:
                 break
+
+    def fold(self, leaving: int) -> None:
+        """The oldest leave; what they say of the two after them stays, linearised here.
+
+        The Schur complement of all terms that touch them, eliminated one after the other.
+        """
+        stay = self.count - leaving
+        if stay < 2:
+            self.reset()
+            return
+        workspace, n = self._workspace, leaving + 2
+        hessian, gradient = workspace.hessian[:n], workspace.gradient[:n]
+        self._evaluate(self._theta[:n], owned=leaving)
+        if band.eliminate(hessian, gradient, leaving, 0.0, _RIDGE, workspace.square[0]):
+            self._prior = (
+                hessian[leaving:].copy(),
+                gradient[leaving:].copy(),
+                self._theta[leaving:n].copy(),
+            )
+        else:
+            self._prior = None
+        measured = self._measured
+        for array in (self._times_ns, self._theta, self._feet_m, *measured[:5]):
+            array[:stay] = array[leaving : self.count]
+        measured.steps[: stay - 1] = measured.steps[leaving : self.count - 1]
+        self.count = stay
+
+    def pose(self, back: int = 0) -> Float[np.ndarray, " p"]:
+        """The pose `back` instants before the newest, angles at most pi."""
+        theta = self._theta[self.count - 1 - back].copy()
+        wrap_pose(theta)
         return theta
 
-    def _evaluate(
-        self,
-        theta: Float[np.ndarray, "n p"],
-        measured: groups.Window,
-        hessian_out: np.ndarray,
-        gradient_out: np.ndarray,
-    ) -> float:
-        n = len(theta)
-        return window.evaluate_window(
+    def back(self, lag_s: float) -> int | None:
+        """How many instants before the newest is the first at least `lag_s` old; None: no one.
+
+        A full window that spans less answers with its oldest.
+        """
+        ages_s = (self._times_ns[self.count - 1] - self._times_ns[: self.count]) * 1e-9
+        old = np.flatnonzero(ages_s >= lag_s - EXACT_S)
+        if len(old):
+            return self.count - 1 - int(old[-1])
+        return self.count - 1 if self.count == self.size else None
+
+    def _evaluate(self, theta: Float[np.ndarray, "n p"], owned: int | None = None) -> float:
+        """Cost, with normal equations in the workspace, of terms that touch the first `owned`."""
+        workspace, measured, n = self._workspace, self._measured, len(theta)
+        hessian, gradient = workspace.hessian[:n], workspace.gradient[:n]
+        cost = window.evaluate_window(
             theta,
+            n if owned is None else owned,
             self._solver.model,
-            measured,
-            groups.Posed(*(array[:n] for array in self._posed)),
-            groups.Gathered(*(array[:n] for array in self._gathered)),
-            self._scratch,
-            self._motions[:n],
-            self._lever,
-            self._square,
-            hessian_out,
-            gradient_out,
+            groups.Window(
+                measured.keypoints[:n],
+                measured.rotation[:n],
+                measured.present[:n],
+                measured.force[:n],
+                measured.contact[:n],
+                measured.steps[: n - 1],
+                measured.steadiness,
+            ),
+            groups.Posed(*(array[:n] for array in workspace.posed)),
+            groups.Gathered(*(array[:n] for array in workspace.gathered)),
+            workspace.scratch,
+            workspace.motions[:n],
+            workspace.lever,
+            workspace.square,
+            hessian,
+            gradient,
         )
+        if self._prior is not None:
+            cost += window.add_folded(*self._prior, theta[:2], hessian[:2], gradient[:2])
+        return cost

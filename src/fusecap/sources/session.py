@@ -301,6 +301,7 @@ class WeightSettings(_Table):
     """`[estimator] weights`; None: the estimator's default."""
 
     position: NotNegative | None = None
+    growth: NotNegative | None = None
     orientation: NotNegative | None = None
     acceleration: NotNegative | None = None
     projection: NotNegative | None = None
@@ -309,14 +310,15 @@ class WeightSettings(_Table):
     motion: NotNegative | None = None
     increment: NotNegative | None = None
     specific_force: NotNegative | None = None
+    rest: NotNegative | None = None
 
 
 class EstimatorSettings(_Table):
     """`[estimator]`; None: the estimator's default."""
 
-    smooth: Flag = False
-    """Solve all instants of a person together, so that takes hold a motion."""
     weights: WeightSettings = WeightSettings()
+    window: Annotated[int, Field(strict=True, ge=1, le=1000)] | None = None
+    """Instants solved together; 1: each alone."""
     max_iterations: Annotated[int, Field(strict=True, ge=1)] | None = None
     function_tolerance: Positive | None = None
     floor_radius_m: NotNegative | None = None

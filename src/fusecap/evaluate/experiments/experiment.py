@@ -18,16 +18,16 @@ from fusecap.evaluate.cells import TwinCell
 from fusecap.evaluate.runner import Outcome
 from fusecap.evaluate.tables import Table, Value
 from fusecap.evaluate.twin import twin_sequences
-from fusecap.solve.options import SMOOTH, Weights
+from fusecap.solve.options import Weights
 
 WEIGHTS: Mapping[str, Weights] = {
     "default": Weights(),
-    "smooth": Weights(**SMOOTH),
+    "alone": Weights().alone(),
     "no-acceleration": replace(Weights.paper(), acceleration=0.0),
     "paper": Weights.paper(),
 }
-"""The solver's own weights; those that solve all instants of a person together; the paper's without
-its acceleration term; the paper's as printed."""
+"""The solver's own weights; the same with each instant alone; the paper's without its acceleration
+term; the paper's as printed."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,6 +22,7 @@ from fusecap.evaluate.experiments.experiment import (
 from fusecap.evaluate.experiments.figure7 import FIGURE7
 from fusecap.evaluate.experiments.figure9 import FIGURE9
 from fusecap.evaluate.experiments.figure10 import FIGURE10
+from fusecap.evaluate.experiments.motion import MOTION
 from fusecap.evaluate.experiments.people import PEOPLE
 from fusecap.evaluate.experiments.table1 import TABLE1
 from fusecap.evaluate.experiments.table2 import TABLE2
@@ -34,7 +35,7 @@ from fusecap.files import plain, written_whole
 
 EXPERIMENTS = {
     each.name: each
-    for each in (TABLE1, FIGURE7, TABLE2, TABLE3, TABLE4, FIGURE9, FIGURE10, PEOPLE, TUNING)
+    for each in (TABLE1, FIGURE7, TABLE2, TABLE3, TABLE4, FIGURE9, FIGURE10, PEOPLE, TUNING, MOTION)
 }
 _HOLDS = {False: "does NOT hold", None: "undecided", True: "holds"}
 

@@ -20,7 +20,7 @@ GRAVITY_M_S2 = 9.80665
 
 
 @kernel("void(f8, f8, f8, f8, f8[:, ::1])")
-def _lever(c, dx, dy, dz, a_out):
+def lever_of(c, dx, dy, dz, a_out):
     """The matrix c [I, -[d]] (3, 6)."""
     for i in range(3):
         for j in range(3):
@@ -58,7 +58,7 @@ def add_specific_force(weight, sensors, force, difference, posed, lever, gathere
             ux += c * x
             uy += c * y
             uz += c * z
-            _lever(
+            lever_of(
                 c,
                 x - position[k, 0, 0],
                 y - position[k, 0, 1],
