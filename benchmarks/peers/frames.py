@@ -13,6 +13,7 @@ import argparse
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,11 +23,12 @@ from pose_problem import Problems, build_problems, write_problems
 from solve_scene import scene
 
 from fusecap.solve.estimator import Estimator
-from fusecap.solve.options import SolverOptions, Weights
+from fusecap.solve.options import SMOOTH, SolverOptions, Weights
 from fusecap.solve.pose_solver import Measurements, PoseSolver, Solution
+from fusecap.types import Observation
 
 FLOOR_BONES = ("left_foot", "left_toes", "right_foot", "right_toes")
-WEIGHTS = {"default": Weights(), "paper": Weights.paper()}
+WEIGHTS = {"default": Weights(), "paper": Weights.paper(), "smooth": Weights(**SMOOTH)}
 _SETTLED = 3
 """Frames before the first that is written: it starts from a tracked pose, and IMUs have history."""
 
@@ -41,8 +43,16 @@ class _RecordingSolver(PoseSolver):
         return super().solve(theta, data)
 
 
-def record_problems(*, frames: int, weights: str) -> tuple[Problems, PoseSolver, PoseSolver]:
+class Recorded(NamedTuple):
     """The problems; the solver that they were put to; the same one with quality per bone."""
+
+    problems: Problems
+    solver: PoseSolver
+    with_quality: PoseSolver
+    observations: list[Observation]
+
+
+def record_problems(*, frames: int, weights: str) -> Recorded:
     options = SolverOptions(weights=WEIGHTS[weights], quality=False)
     built = scene(cameras=8, frames=frames + _SETTLED)
     model, rig = built.models[0], built.simulation.rig
@@ -61,7 +71,8 @@ def record_problems(*, frames: int, weights: str) -> tuple[Problems, PoseSolver,
     recorder = _RecordingSolver(**parts)
     estimator.solver = recorder
     asked = []
-    for observation in built.observations():
+    observations = built.observations()
+    for observation in observations:
         recorder.asked = []
         estimator.update(observation)
         asked += recorder.asked[:1]  # without restarts
@@ -70,7 +81,9 @@ def record_problems(*, frames: int, weights: str) -> tuple[Problems, PoseSolver,
         **parts, floor_bones=FLOOR_BONES, starts=np.stack(starts), data=list(data)
     )
     with_quality = parts | {"options": replace(options, quality=True)}
-    return problems, PoseSolver(**parts), PoseSolver(**with_quality)
+    return Recorded(
+        problems, PoseSolver(**parts), PoseSolver(**with_quality), observations[_SETTLED:]
+    )
 
 
 def main() -> None:
@@ -79,7 +92,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=400)
     parser.add_argument("--weights", choices=WEIGHTS, default="default")
     arguments = parser.parse_args()
-    problems, _, _ = record_problems(frames=arguments.frames, weights=arguments.weights)
+    problems = record_problems(frames=arguments.frames, weights=arguments.weights).problems
     write_problems(problems, arguments.out)
     print(f"{len(problems)} frames in {arguments.out}")
 

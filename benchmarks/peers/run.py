@@ -11,6 +11,7 @@ fusecap's beside it, so that other work on the machine counts little and counts 
 from __future__ import annotations
 
 import argparse
+import os
 import shutil
 import subprocess
 import time
@@ -35,6 +36,9 @@ CERES = {
     "grouped": "Ceres at its best: analytic, grouped, dense",
     "reduced": "the same, landmarks reduced over cameras first",
 }
+ONE_THREAD = {"OMP_THREAD_LIMIT": "1", "OPENBLAS_NUM_THREADS": "1"}
+"""CHOLMOD, which factors Ceres' sparse systems, asks for four threads whatever OMP_NUM_THREADS
+is; on one core they wait for each other."""
 _CERES_COLUMNS = 7
 """Before the pose in a row of the program's output, see ceres/main.cpp."""
 
@@ -74,7 +78,7 @@ class Row:
         return 1e3 * np.median([each.seconds for each in self.passes], axis=0)
 
 
-def build_ceres(folder: Path) -> Path:
+def build_ceres(folder: Path, program: str = "ceres_peer") -> Path:
     """The compiled program; ends the run with instructions where something is missing."""
     if shutil.which("cmake") is None:
         raise SystemExit(f"cmake is not installed; {INSTALL}")
@@ -86,7 +90,7 @@ def build_ceres(folder: Path) -> Path:
             raise SystemExit(f"CMake finds no Ceres; {INSTALL}")
         if done.returncode:
             raise SystemExit(f"{' '.join(command)} failed:\n{done.stdout}\n{done.stderr}")
-    return folder / "ceres_peer"
+    return folder / program
 
 
 def fusecap_pass(solver: PoseSolver, problems: Problems) -> Pass:
@@ -107,7 +111,8 @@ def fusecap_pass(solver: PoseSolver, problems: Problems) -> Pass:
 
 def ceres_pass(program: Path, problem_file: Path, variant: str, damping: float) -> Pass:
     out = problem_file.with_suffix(".out")
-    subprocess.run([program, problem_file, out, variant, str(damping)], check=True)
+    command = [program, problem_file, out, variant, str(damping)]
+    subprocess.run(command, check=True, env=os.environ | ONE_THREAD)
     rows = np.fromfile(out, "<f8").reshape(-1, _CERES_COLUMNS + 66)
     return Pass(
         seconds=rows[:, 4],
@@ -199,7 +204,7 @@ def main() -> None:
     version = subprocess.run(
         [program, "--version"], check=True, capture_output=True, text=True
     ).stdout
-    problems, solver, with_quality = record_problems(
+    problems, solver, with_quality, _ = record_problems(
         frames=arguments.frames, weights=arguments.weights
     )
     problem_file = arguments.folder / "problems.bin"

@@ -6,6 +6,7 @@
 #include <ceres/ceres.h>
 #include <ceres/rotation.h>
 
+#include <algorithm>
 #include <cmath>
 #include <tuple>
 #include <type_traits>
@@ -25,6 +26,18 @@ void ToWorld(const Problem& problem, const std::vector<int>& chain, const T* roo
     ceres::AngleAxisRotatePoint(vectors[k], x, turned);
     const double* offset = problem.offsets + 3 * chain[k];
     for (int i = 0; i < 3; ++i) x[i] = turned[i] + (k ? T(offset[i]) : root[i]);
+  }
+}
+
+// Where a bone faces in the world, as a quaternion.
+template <typename T>
+void Turned(const Problem& problem, int bone, T const* const* vectors, T* q) {
+  ceres::AngleAxisToQuaternion(vectors[0], q);
+  for (std::size_t k = 1; k < problem.chains[bone].size(); ++k) {
+    T local[4], product[4];
+    ceres::AngleAxisToQuaternion(vectors[k], local);
+    ceres::QuaternionProduct(q, local, product);
+    std::copy(product, product + 4, q);
   }
 }
 
@@ -70,15 +83,8 @@ struct Orientation {  // eq. 8-10
   template <typename T>
   bool operator()(T const* const* parameters, T* r) const {
     // q = (q_0 q_1 ... q_bone)⁻¹ q_measured
-    const std::vector<int>& chain = problem->chains[bone];
     T turned[4];
-    ceres::AngleAxisToQuaternion(parameters[0], turned);
-    for (std::size_t k = 1; k < chain.size(); ++k) {
-      T local[4], product[4];
-      ceres::AngleAxisToQuaternion(parameters[k], local);
-      ceres::QuaternionProduct(turned, local, product);
-      std::copy(product, product + 4, turned);
-    }
+    Turned(*problem, bone, parameters, turned);
     double target[4];
     ceres::RotationMatrixToQuaternion(ceres::RowMajorAdapter3x3(measured), target);
     const T wanted[4] = {T(target[0]), T(target[1]), T(target[2]), T(target[3])};
@@ -175,16 +181,19 @@ ceres::CostFunction* Templated(const Term& term, int residuals, std::index_seque
     return new Function(new Unpacked<Term>{term});
 }
 
+template <typename Term>
+ceres::CostFunction* Dynamic(const Term& term, int residuals, int blocks) {
+  auto* function = new ceres::DynamicAutoDiffCostFunction<Term>(new Term(term));
+  for (int i = 0; i < blocks; ++i) function->AddParameterBlock(3);
+  function->SetNumResiduals(residuals);
+  return function;
+}
+
 // `kFrom` to `kTo` are the numbers of blocks that the term can have; `residuals` is kResiduals where
 // that is not ceres::DYNAMIC.
 template <int kResiduals, int kFrom, int kTo, typename Term>
 ceres::CostFunction* AutoDiff(const Term& term, int residuals, int blocks, bool dynamic) {
-  if (dynamic) {
-    auto* function = new ceres::DynamicAutoDiffCostFunction<Term>(new Term(term));
-    for (int i = 0; i < blocks; ++i) function->AddParameterBlock(3);
-    function->SetNumResiduals(residuals);
-    return function;
-  }
+  if (dynamic) return Dynamic(term, residuals, blocks);
   if (blocks == kFrom)
     return Templated<kResiduals>(term, residuals, std::make_index_sequence<kFrom>());
   if constexpr (kFrom < kTo)
@@ -192,13 +201,19 @@ ceres::CostFunction* AutoDiff(const Term& term, int residuals, int blocks, bool 
   throw std::runtime_error("no cost function is compiled for a chain of this length");
 }
 
+// The parameter blocks that a point on `bone` depends on; without the root's place, its rotation.
+inline std::vector<double*> ChainBlocks(const Problem& problem, int bone, bool with_root,
+                                        double* theta) {
+  std::vector<double*> found;
+  if (with_root) found.push_back(theta);
+  for (int b : problem.chains[bone]) found.push_back(theta + 3 + 3 * b);
+  return found;
+}
+
 inline void BuildAsPaper(const Problem& problem, const Frame& frame, double* theta, bool dynamic,
                          ceres::Problem* built) {
   const auto blocks = [&](int bone, bool with_root) {
-    std::vector<double*> found;
-    if (with_root) found.push_back(theta);
-    for (int b : problem.chains[bone]) found.push_back(theta + 3 + 3 * b);
-    return found;
+    return ChainBlocks(problem, bone, with_root, theta);
   };
   const auto robust = [] { return new ceres::CauchyLoss(1.0); };
   const double* weights = problem.weights;

@@ -8,7 +8,6 @@
 // (1 or 0), processor seconds of Solve, of building the problem, of the linear solver, final pose.
 #include <ceres/ceres.h>
 #include <glog/logging.h>
-#include <time.h>
 
 #include <cstdio>
 #include <fstream>
@@ -17,14 +16,8 @@
 
 #include "as_paper.h"
 #include "at_best.h"
+#include "clock.h"
 #include "problem.h"
-
-// Of all threads of this process: other programs on the machine do not count.
-static double ProcessorSeconds() {
-  timespec now;
-  clock_gettime(CLOCK_PROCESS_CPUTIME_ID, &now);
-  return now.tv_sec + 1e-9 * now.tv_nsec;
-}
 
 static std::vector<double> SolveFrame(const Problem& problem, const Frame& frame,
                                       const std::string& variant, double damping,

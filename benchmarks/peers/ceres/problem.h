@@ -1,10 +1,42 @@
 // Reads the file that benchmarks/peers/pose_problem.py writes; the layout is described there.
 #pragma once
 
+#include <cstddef>
 #include <fstream>
 #include <stdexcept>
 #include <string>
 #include <vector>
+
+// A file of float64, taken from its start on.
+class Numbers {
+ protected:
+  Numbers(const std::string& path, double magic) : path_(path) {
+    std::ifstream file(path, std::ios::binary | std::ios::ate);
+    if (!file) throw std::runtime_error("cannot read " + path);
+    values_.resize(file.tellg() / sizeof(double));
+    file.seekg(0);
+    file.read(reinterpret_cast<char*>(values_.data()), values_.size() * sizeof(double));
+    next_ = values_.data();
+    if (*Take(1) != magic) throw std::runtime_error(path + " holds something else");
+  }
+  const double* Take(std::size_t count) {
+    if (Left() < count) throw std::runtime_error(path_ + " is cut short");
+    const double* taken = next_;
+    next_ += count;
+    return taken;
+  }
+  int Integer() { return static_cast<int>(*Take(1)); }
+  std::vector<int> Integers(int count) {
+    const double* taken = Take(count);
+    return std::vector<int>(taken, taken + count);
+  }
+  std::size_t Left() const { return values_.data() + values_.size() - next_; }
+
+ private:
+  std::string path_;
+  std::vector<double> values_;
+  const double* next_;
+};
 
 struct Frame {
   const double* start;         // pose
@@ -15,17 +47,9 @@ struct Frame {
   const double* imu_history;   // (t-1, t-2), imu, 3
 };
 
-class Problem {
+class Problem : Numbers {
  public:
-  explicit Problem(const std::string& path) {
-    std::ifstream file(path, std::ios::binary | std::ios::ate);
-    if (!file) throw std::runtime_error("cannot read " + path);
-    values_.resize(file.tellg() / sizeof(double));
-    file.seekg(0);
-    file.read(reinterpret_cast<char*>(values_.data()), values_.size() * sizeof(double));
-    next_ = values_.data();
-    if (values_.size() < 8 || *Take(1) != 20201.0)
-      throw std::runtime_error(path + " holds no pose problems");
+  explicit Problem(const std::string& path) : Numbers(path, 20201.0) {
     bones = Integer();
     landmarks = Integer();
     cameras = Integer();
@@ -50,10 +74,9 @@ class Problem {
     function_tolerance = *Take(1);
     max_iterations = Integer();
     pose = 3 + 3 * bones;
-    first_ = next_;
     row_ = pose + 1 + 3 * cameras * landmarks + 18 * imus;
-    if (static_cast<std::size_t>(first_ - values_.data() + row_ * frames) != values_.size())
-      throw std::runtime_error(path + " has another length than it says");
+    first_ = Take(static_cast<std::size_t>(row_) * frames);
+    if (Left()) throw std::runtime_error(path + " is longer than it says");
     for (int bone = 0; bone < bones; ++bone) {
       chains.push_back(bone ? chains[parents[bone]] : std::vector<int>());
       chains.back().push_back(bone);
@@ -80,21 +103,7 @@ class Problem {
   double floor_radius, function_tolerance;
 
  private:
-  const double* Take(std::size_t count) {
-    if (static_cast<std::size_t>(next_ - values_.data()) + count > values_.size())
-      throw std::runtime_error("the problem file is cut short");
-    const double* taken = next_;
-    next_ += count;
-    return taken;
-  }
-  int Integer() { return static_cast<int>(*Take(1)); }
-  std::vector<int> Integers(int count) {
-    const double* taken = Take(count);
-    return std::vector<int>(taken, taken + count);
-  }
-
-  std::vector<double> values_;
-  const double *next_, *first_;
+  const double* first_;
   std::size_t row_;
 };
 
