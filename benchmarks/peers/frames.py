@@ -23,12 +23,17 @@ from pose_problem import Problems, build_problems, write_problems
 from solve_scene import scene
 
 from fusecap.solve.estimator import Estimator
-from fusecap.solve.options import SMOOTH, SolverOptions, Weights
+from fusecap.solve.options import SolverOptions, Weights
 from fusecap.solve.pose_solver import Measurements, PoseSolver, Solution
 from fusecap.types import Observation
 
 FLOOR_BONES = ("left_foot", "left_toes", "right_foot", "right_toes")
-WEIGHTS = {"default": Weights(), "paper": Weights.paper(), "smooth": Weights(**SMOOTH)}
+WEIGHTS = {
+    "default": Weights().alone(),
+    "paper": Weights.paper(),
+    "window": Weights(growth=0.0, position=1e-3, rest=0.0),
+}
+"""Of single poses, and of windows, without what depends on the pose before: contacts, sizes."""
 _SETTLED = 3
 """Frames before the first that is written: it starts from a tracked pose, and IMUs have history."""
 
@@ -53,7 +58,7 @@ class Recorded(NamedTuple):
 
 
 def record_problems(*, frames: int, weights: str) -> Recorded:
-    options = SolverOptions(weights=WEIGHTS[weights], quality=False)
+    options = SolverOptions(weights=WEIGHTS[weights], window=1, quality=False)
     built = scene(cameras=8, frames=frames + _SETTLED)
     model, rig = built.models[0], built.simulation.rig
     assert model.shape is not None

@@ -17,14 +17,14 @@ from pathlib import Path
 import numpy as np
 from frames import Recorded, record_problems
 from pose_problem import Problems
-from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
 
-from fusecap.kernels import groups, window
+from fusecap.kernels import band, groups
 from fusecap.solve.window_solver import WindowSolver
 
 MAGIC = 20202.0
 REACHED = 1e-4
 """A window is solved when its cost is within this share of the minimum."""
+DAMPING = 1e-4
 _STEPS = 50
 
 
@@ -43,64 +43,59 @@ class Windows:
 
     def __init__(self, recorded: Recorded, length: int) -> None:
         self.recorded, self.length = recorded, length
-        times_ns = np.array([one.timestamp_ns for one in recorded.observations])
-        self.measured = recorded.solver.window(times_ns, recorded.observations)
-        self._solver = WindowSolver(recorded.solver)
-        self._damping = recorded.solver.options.initial_damping**2
-        p = recorded.solver.skeleton.pose_size
-        self._normal = [(np.zeros((length, 3, p, p)), np.zeros((length, p))) for _ in range(2)]
-        self._band = np.zeros((length * p, 3 * p))
-        m = self.measured
+        pose = np.zeros(recorded.solver.skeleton.pose_size)
+        whole = WindowSolver(recorded.solver, len(recorded.observations))
+        for observation in recorded.observations:
+            whole.push(observation, pose)
+        self.measured = whole._measured
+        self._solver = WindowSolver(recorded.solver, length)
         self._windows = [
             groups.Window(
-                keypoints=m.keypoints[w : w + length],
-                rotation=m.rotation[w : w + length],
-                present=m.present[w : w + length],
-                force=m.force[w : w + length],
-                steps=m.steps[w : w + length - 1],
-                steadiness=m.steadiness,
+                *(array[w : w + length] for array in self.measured[:5]),
+                self.measured.steps[w : w + length - 1],
+                self.measured.steadiness,
             )
-            for w in range(len(times_ns) - length + 1)
+            for w in range(whole.count - length + 1)
         ]
 
     def __len__(self) -> int:
         return len(self._windows)
 
-    def evaluate(self, w: int, theta: np.ndarray, into: int = 0) -> float:
+    def evaluate(self, w: int, theta: np.ndarray) -> float:
         """Cost, and normal equations; the one place that knows how fusecap computes them."""
-        return self._solver._evaluate(theta, self._windows[w], *self._normal[into])
+        self._solver._measured = self._windows[w]
+        return self._solver._evaluate(theta)
 
-    def _step(self, damping: float, at: int) -> np.ndarray:
-        """Raises `LinAlgError` where the matrix is not positive."""
-        hessian, gradient = self._normal[at]
-        window.banded(hessian, damping, self._band)
-        factor = cholesky_banded(self._band.T, overwrite_ab=True, lower=True, check_finite=False)
-        step = cho_solve_banded((factor, True), -gradient.ravel(), check_finite=False)
-        return step.reshape(gradient.shape)
+    def _step(self, damping: float) -> np.ndarray | None:
+        """None where the matrix is not positive."""
+        workspace, n = self._solver._workspace, self.length
+        positive = band.eliminate(
+            workspace.hessian, workspace.gradient, n, damping, 1e-9, workspace.square[0]
+        )
+        if not positive:
+            return None
+        band.step_of(workspace.hessian, workspace.gradient, workspace.step)
+        return workspace.step
 
     def step(self, w: int, theta: np.ndarray) -> np.ndarray:
-        """After one Gauss-Newton step, all that a new instant needs where that is enough."""
+        """After one Gauss-Newton step, mostly all that a new instant needs."""
         self.evaluate(w, theta)
-        return theta + self._step(self._damping, 0)
+        return theta + self._step(DAMPING)
 
     def solve(self, w: int, theta: np.ndarray, target: float = -np.inf) -> Solved:
         """Levenberg-Marquardt as `WindowSolver` does it, to a cost or as far as it goes."""
-        damping, at, solves = self._damping, 0, 0
-        cost = self.evaluate(w, theta, at)
-        while cost > target and solves < _STEPS:
+        damping, solves = DAMPING, 0
+        cost = self.evaluate(w, theta)
+        while cost > target and solves < _STEPS and damping <= 1e6:
             solves += 1
-            try:
-                trial = theta + self._step(damping, at)
-            except LinAlgError:
-                damping *= 10.0
-                continue
-            trial_cost = self.evaluate(w, trial, 1 - at)
+            step = self._step(damping)
+            trial = theta if step is None else theta + step
+            trial_cost = self.evaluate(w, trial)
             if not trial_cost < cost:
                 damping *= 10.0
-                if damping > 1e6:
-                    break
+                self.evaluate(w, theta)
                 continue
-            theta, cost, at, damping = trial, trial_cost, 1 - at, max(damping / 10.0, 1e-8)
+            theta, cost, damping = trial, trial_cost, max(damping / 10.0, 1e-8)
         return Solved(theta=theta, cost=cost, solves=solves)
 
 
@@ -119,7 +114,7 @@ class WindowProblems:
 
 
 def record_windows(*, count: int, length: int) -> WindowProblems:
-    recorded = record_problems(frames=count + length - 1, weights="smooth")
+    recorded = record_problems(frames=count + length - 1, weights="window")
     windows = Windows(recorded, length)
     alone = np.stack(
         [
