@@ -57,6 +57,10 @@ def test_demo_reports_errors_and_speed_and_writes_files(tmp_path):
     assert report["simulated"] is True
     assert 0 < report["position_error_mm"] < 60
     assert 0 < report["orientation_error_deg"] < 25
+    assert report["true_jitter_km_s3"] < report["jitter_km_s3"] < 1.0
+    assert 0 < report["foot_skate_m_s"] < 0.3
+    assert report["lag"]["lag_s"] == 0.1
+    assert report["lag"]["jitter_km_s3"] < report["newest"]["jitter_km_s3"]
     assert report["subjects"] == 2
     assert report["identity_switches"] == 0
     assert 0 < report["solve_ms_median"] <= report["solve_ms_p99"]

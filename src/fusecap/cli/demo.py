@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from fusecap.take import Take
 
 EXAMPLE = "Example: fusecap demo --out demo --json"
+LAG_S = 0.1
 
 
 def demo(
@@ -42,8 +43,8 @@ def demo(
 
     from fusecap.evaluate import simulated_session
     from fusecap.evaluate.demo_scene import demo_scene
-    from fusecap.evaluate.score import score_take
-    from fusecap.evaluate.simulated_solve import solve_simulation
+    from fusecap.evaluate.score import main_figures, score_take
+    from fusecap.evaluate.simulated_solve import live_takes, solve_simulation
 
     if view and as_json:
         raise typer.BadParameter(
@@ -55,12 +56,15 @@ def demo(
         simulated_session.write_session(simulation, write_session)
     with progress(quiet=as_json) as show:
         solved = solve_simulation(simulation, associate=associate, progress=show)
+        live = live_takes(simulation, associate=associate, lag_s=LAG_S, progress=show)
     files = write_take(solved.take, out / "demo.npz", exports=["bvh"], unit="m", picture=True)
     score = score_take(solved.take, simulation.truth)
+    newest, settled = (score_take(take, simulation.truth) for take in live)
     result = {
         "simulated": True,
-        "position_error_mm": score.position_error_mm.mean,
-        "orientation_error_deg": score.orientation_error_deg.mean,
+        **main_figures(score),
+        "newest": main_figures(newest),
+        "lag": main_figures(settled) | {"lag_s": LAG_S},
         "solve_ms_median": solved.report.solve_ms_median,
         "solve_ms_p99": solved.report.solve_ms_p99,
         "subjects": score.subjects,
@@ -78,6 +82,15 @@ def demo(
         console.print(styled(("Simulated scene", "bold"), what))
         console.print(f"  position error     {_spread(score.position_error_mm)} mm")
         console.print(f"  orientation error  {_spread(score.orientation_error_deg)} deg")
+        console.print(
+            f"  as live            {newest.position_error_mm.mean:.1f} mm at once, "
+            f"{settled.position_error_mm.mean:.1f} mm {1e3 * LAG_S:.0f} ms late (means)"
+        )
+        console.print(
+            f"  motion             jitter {score.jitter_km_s3:.2f} km/s3 (the truth's "
+            f"{score.true_jitter_km_s3:.2f}), feet on the floor slide at "
+            f"{score.foot_skate_m_s:.2f} m/s ({score.true_foot_skate_m_s:.2f})"
+        )
         console.print(
             f"  people             {score.subjects} subjects, {score.identity_switches} identity "
             f"switches, {100 * score.found_share:.1f} % of frames found"

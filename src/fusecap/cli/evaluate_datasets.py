@@ -6,8 +6,9 @@ JSON. docs/datasets.md says which files belong where.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -51,6 +52,7 @@ def session(
     """Solve a session and score it against its truth, as `fusecap simulate` writes it."""
     from fusecap.batch.solve import solve_session
     from fusecap.evaluate.datasets.session import session_table
+    from fusecap.evaluate.score import main_figures, score_take
     from fusecap.sources.session_data import open_session
     from fusecap.sources.session_file import load_session
     from fusecap.take import load_take
@@ -60,7 +62,10 @@ def session(
     with progress(quiet=as_json) as show:
         solved = solve_session(open_session(loaded, show), progress=show)
     _notes(solved.report.notes, as_json)
-    _report(session_table(solved.take, known, loaded.settings.name), out, "session", as_json)
+    score = score_take(solved.take, known)
+    simulated = bool(known.provenance.get("simulated"))
+    table = session_table(score, loaded.settings.name, simulated=simulated)
+    _report(table, out, "session", as_json, main_figures(score))
 
 
 def totalcapture(
@@ -179,12 +184,19 @@ def _notes(notes: Iterable[str], as_json: bool) -> None:
         note(text)
 
 
-def _report(table: Table, out: Path, name: str, as_json: bool) -> None:
+def _report(
+    table: Table,
+    out: Path,
+    name: str,
+    as_json: bool,
+    figures: Mapping[str, float] = MappingProxyType({}),
+) -> None:
+    """Writes a table, and shows it; `figures` go to `--json` beside it."""
     from fusecap.evaluate.datasets.score import write_table
 
     files = write_table(table, out, name)
     if as_json:
-        print_json(table.as_json() | {"files": [str(path) for path in files]})
+        print_json({**table.as_json(), **figures, "files": [str(path) for path in files]})
         return
     shown = table_of(*table.columns, title=table.title, title_justify="left")
     for row in table.rows:

@@ -76,6 +76,19 @@ class TakeScore:
     """Estimated ones that were tracked at all."""
 
 
+def main_figures(score: TakeScore) -> dict[str, float]:
+    """Means of the errors and of how it moves, by names with units, for `--json`."""
+    return {
+        "position_error_mm": score.position_error_mm.mean,
+        "orientation_error_deg": score.orientation_error_deg.mean,
+        "acceleration_error_m_s2": score.acceleration_error_m_s2,
+        "jitter_km_s3": score.jitter_km_s3,
+        "true_jitter_km_s3": score.true_jitter_km_s3,
+        "foot_skate_m_s": score.foot_skate_m_s,
+        "true_foot_skate_m_s": score.true_foot_skate_m_s,
+    }
+
+
 def score_take(take: Take, truth: Take, *, gate_m: float = 0.5) -> TakeScore:
     """Score the frames that both takes have; people are matched frame by frame, by distance."""
     if take.bone_names != truth.bone_names:

@@ -37,15 +37,16 @@ def solve_simulation(
 def live_takes(
     simulation: Simulation,
     *,
-    options: SolverOptions | None = None,
     lag_s: float,
+    options: SolverOptions | None = None,
+    associate: str = "tracker",
     progress: Progress | None = None,
 ) -> tuple[Take, Take]:
     """What a live run has: every pose as it comes, and as it is `lag_s` later.
 
     The last instants of the second have not settled and are missing.
     """
-    setup = setup_of_simulation(simulation, options=options)
+    setup = setup_of_simulation(simulation, options=options, associate=associate)
     pipeline, instants = Pipeline(setup), _Instants(simulation)
     times_ns: list[int] = []
     newest: dict[int, list[Estimate]] = {}

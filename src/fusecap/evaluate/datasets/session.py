@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from fusecap.evaluate.score import score_take
+from fusecap.evaluate.score import TakeScore
 from fusecap.evaluate.tables import Table
-from fusecap.take import Take
 
 
-def session_table(take: Take, truth: Take, name: str) -> Table:
+def session_table(score: TakeScore, name: str, *, simulated: bool) -> Table:
     """The whole score of a take, a row per figure."""
-    score = score_take(take, truth)
     rows: list[tuple[str, float, float | None, float | None, float | None]] = [
         (what, each.mean, each.std, each.median, each.mad)
         for what, each in (
@@ -25,13 +23,16 @@ def session_table(take: Take, truth: Take, name: str) -> Table:
         (what, value, None, None, None)
         for what, value in (
             ("acceleration error m/s²", score.acceleration_error_m_s2),
+            ("jitter km/s³", score.jitter_km_s3),
+            ("jitter of the truth km/s³", score.true_jitter_km_s3),
+            ("foot skate m/s", score.foot_skate_m_s),
+            ("foot skate of the truth m/s", score.true_foot_skate_m_s),
             ("found % of person-frames", 100.0 * score.found_share),
             ("extra % of person-frames", 100.0 * score.extra_share),
             ("identity switches", float(score.identity_switches)),
             ("IDF1 %", 100.0 * score.idf1),
         )
     ]
-    simulated = bool(truth.provenance.get("simulated"))
     return Table(
         title=f"Session {name}{' (simulated)' if simulated else ''}",
         columns=("figure", "mean", "std", "median", "MAD"),
