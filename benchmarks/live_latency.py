@@ -123,7 +123,7 @@ def table(mode: str, report: LiveReport) -> str:
     """The report as Markdown."""
     inputs = [source for source in report.inputs if source.kind == "camera"]
     seen = {
-        name: f"{100 * subject.measured_share:.1f} % (quality {subject.mean_quality:.2f})"
+        name: f"{100 * subject.measured_share:.1f} % (bones +- {subject.bone_sigma_deg:.1f} deg)"
         for name, subject in report.subjects.items()
     }
     rows = [

@@ -65,7 +65,7 @@ class Scene(NamedTuple):
             landmarks_in_world_m=np.full((25, 3), np.nan),
         )
 
-    def estimator(self, *, quality: bool = True) -> Estimator:
+    def estimator(self, *, window: int = 1) -> Estimator:
         """Of the first subject."""
         simulation = self.simulation
         return Estimator(
@@ -74,7 +74,7 @@ class Scene(NamedTuple):
             landmarks=simulation.landmark_set,
             prior=self.prior,
             skeleton=self.models[0].shape.skeleton,
-            options=SolverOptions(quality=quality),
+            options=SolverOptions(window=window),
         )
 
 

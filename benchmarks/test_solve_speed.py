@@ -108,18 +108,18 @@ def test_kernel(benchmark, frames):
     record(benchmark, frames, solve)
 
 
-@pytest.mark.parametrize("quality", [False, True], ids=["without_quality", "with_quality"])
-def test_pose_solver(benchmark, frames, quality):
-    solver = frames.scene.estimator(quality=quality).solver
+def test_pose_solver(benchmark, frames):
+    solver = frames.scene.estimator().solver
     record(benchmark, frames, lambda i: solver.solve(frames.starts[i], frames.data[i]))
 
 
-def test_estimator(benchmark, frames):
-    """What a caller waits for: the solve, its quality, and what is kept for the next frame."""
-    estimator = frames.scene.estimator()
+@pytest.mark.parametrize("window", [1, 5, 8, 10, 12, 20], ids="window of {}".format)
+def test_estimator(benchmark, frames, window):
+    """What a caller waits for: the solve, its error bars, and what is kept for the next frame."""
+    estimator = frames.scene.estimator(window=window)
 
     def restart():
         nonlocal estimator
-        estimator = frames.scene.estimator()
+        estimator = frames.scene.estimator(window=window)
 
     record(benchmark, frames, lambda i: estimator.update(frames.observations[i]), restart)

@@ -11,7 +11,6 @@ from fusecap.engine.continuity import (
     BLEND_S,
     BONE_NOISE_RAD,
     BONE_SPEED_RAD_S,
-    FADE_S,
     JOINT_SPEED_M_S,
     PLACE_NOISE_M,
     Continuity,
@@ -25,7 +24,7 @@ BOTH = (2, True)
 NOTHING = (0, False)
 
 
-def estimate(tick, theta=None, *, shape=SHAPE, track_id=0, quality=0.8):
+def estimate(tick, theta=None, *, shape=SHAPE, track_id=0, sigma_deg=5.0):
     theta = np.zeros(PAPER21.pose_size) if theta is None else theta
     position, rotation = forward_kinematics(shape, theta[None])
     return Estimate(
@@ -35,7 +34,8 @@ def estimate(tick, theta=None, *, shape=SHAPE, track_id=0, quality=0.8):
         theta=theta,
         bone_position_in_world_m=position[0],
         bone_rotation_in_world=rotation[0],
-        bone_quality=np.full(PAPER21.bone_count, quality),
+        bone_sigma_deg=np.full(PAPER21.bone_count, sigma_deg),
+        position_sigma_m=np.full(PAPER21.bone_count, 0.02),
         shape=shape,
         status=Status.CONVERGED,
         iterations=1,
@@ -165,11 +165,11 @@ def test_a_bone_that_turns_goes_on_turning_when_the_footing_changes():
     assert np.diff(arm_rad).min() > 0.029, "never slower than it turned"
 
 
-def test_who_is_not_measured_is_held_and_fades():
+def test_who_is_not_measured_is_held_with_error_bars_that_grow():
     out = sent([estimate(0, at(1.0)), *[None] * 200], hold_s=3.0)
-    quality = [0.0 if e is None else float(e.bone_quality[0]) for e in out]
-    assert (np.diff(quality) <= 0).all() and quality[1] > 0.79
-    assert quality[int(FADE_S * RATE_HZ) + 1] == 0.0
+    sigma_deg = [180.0 if e is None else float(e.bone_sigma_deg[0]) for e in out]
+    assert (np.diff(sigma_deg) >= 0).all() and sigma_deg[1] < 6.0
+    assert sigma_deg[int(2.0 * RATE_HZ) + 1] == 180.0
     assert all(e.theta[0] == 1.0 for e in out[:181]) and out[181:] == [None] * 20
     assert [e.timestamp_ns for e in out[:3]] == [0, 16666667, 33333333]
     assert not out[1].views.any()
@@ -179,7 +179,7 @@ def test_return_after_a_pause_is_blended_and_after_a_long_one_is_not():
     back = [estimate(k, at(1.0)) for k in range(60, 120)]
     out = sent([estimate(0), *[None] * 59, *back])
     assert joint_steps_m(out).max() < 1.875 * 1.0 / BLEND_S / RATE_HZ + 1e-9
-    assert out[60].bone_quality[0] == 0.8 and out[-1] is back[-1]
+    assert out[60].bone_sigma_deg[0] == 5.0 and out[-1] is back[-1]
     out = sent([estimate(0), *[None] * 59, *back], hold_s=0.5)
     assert out[59] is None and out[60] is back[0]
 

@@ -164,7 +164,8 @@ def test_poses_read_back_to_the_same_bits(run, whole):
     for pose, estimate in zip(recorded, sent, strict=True):
         assert pose.name == estimate.name and pose.timestamp_ns == estimate.timestamp_ns
         assert pose.theta.tobytes() == estimate.theta.tobytes()
-        assert pose.bone_quality.tobytes() == estimate.bone_quality.tobytes()
+        assert pose.bone_sigma_deg.tobytes() == estimate.bone_sigma_deg.tobytes()
+        assert pose.position_sigma_m.tobytes() == estimate.position_sigma_m.tobytes()
 
 
 # As others read it
@@ -377,7 +378,7 @@ def message(schema: str, values: object, number: int) -> bytes:
         ("fusecap.Imu", {"subject": "eve", "bone": "head", "timestamp_ns": 0}),
         ("fusecap.Imu", {"subject": ["a"], "bone": {}, "timestamp_ns": 0}),
         ("fusecap.Command", {"kind": "format_disk", "subject": ""}),
-        ("fusecap.Pose", {"name": "anna", "timestamp_ns": 0, "theta": [1], "bone_quality": []}),
+        ("fusecap.Pose", {"name": "anna", "timestamp_ns": 0, "theta": [1], "bone_sigma_deg": []}),
         ("fusecap.Body", {"name": "anna", "height_m": "x", "offsets_m": []}),
         ("fusecap.Body", {"name": "anna", "height_m": 1.0, "offsets_m": [[1, 2, 3]]}),
     ],

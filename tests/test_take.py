@@ -21,7 +21,8 @@ ARRAYS = (
     "bone_position_in_world_m",
     "bone_rotation_in_world_wxyz",
     "tracked",
-    "bone_quality",
+    "bone_sigma_deg",
+    "position_sigma_m",
 )
 
 
@@ -34,7 +35,8 @@ def estimate(shape, theta, name="anna", track_id=1, status=Status.CONVERGED, tim
         theta=theta,
         bone_position_in_world_m=position[0],
         bone_rotation_in_world=rotation[0],
-        bone_quality=np.full(shape.skeleton.bone_count, 0.5),
+        bone_sigma_deg=np.full(shape.skeleton.bone_count, 5.0),
+        position_sigma_m=np.full(shape.skeleton.bone_count, 0.02),
         shape=shape,
         status=status,
         iterations=3,

@@ -547,7 +547,7 @@ def test_a_live_run_is_seen_and_its_buttons_become_commands(browser):
         feeding = threading.Thread(target=feed)
         feeding.start()
         try:
-            shown.get_by_text("quality 1.00").wait_for()
+            shown.get_by_text("±0 deg").wait_for()
             shown.get_by_role("button", name="Find anew").click()
             wait_for(lambda: run.commands)
             assert run.commands == [Command(kind=CommandKind.REINITIALISE)]

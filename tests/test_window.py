@@ -127,9 +127,9 @@ def moved_together(pose_solver, theta, seen):
     motion, poses = WholeMotion(pose_solver), []
     for one, pose in zip(seen, theta, strict=True):
         if not motion.goes_on(one.timestamp_ns):
-            poses += list(motion.end())
-        poses += list(motion.push(one, pose))
-    return np.array([*poses, *motion.end()]).reshape(theta.shape)
+            poses += motion.end()
+        poses += motion.push(one, pose)
+    return np.array([one.theta for one in [*poses, *motion.end()]]).reshape(theta.shape)
 
 
 def disturbed(rng, count=5, scale=0.1, **motion):

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -49,16 +48,15 @@ class _RecordingSolver(PoseSolver):
 
 
 class Recorded(NamedTuple):
-    """The problems; the solver that they were put to; the same one with quality per bone."""
+    """The problems, the solver that they were put to, and what it was shown."""
 
     problems: Problems
     solver: PoseSolver
-    with_quality: PoseSolver
     observations: list[Observation]
 
 
 def record_problems(*, frames: int, weights: str) -> Recorded:
-    options = SolverOptions(weights=WEIGHTS[weights], window=1, quality=False)
+    options = SolverOptions(weights=WEIGHTS[weights], window=1)
     built = scene(cameras=8, frames=frames + _SETTLED)
     model, rig = built.models[0], built.simulation.rig
     assert model.shape is not None
@@ -85,10 +83,7 @@ def record_problems(*, frames: int, weights: str) -> Recorded:
     problems = build_problems(
         **parts, floor_bones=FLOOR_BONES, starts=np.stack(starts), data=list(data)
     )
-    with_quality = parts | {"options": replace(options, quality=True)}
-    return Recorded(
-        problems, PoseSolver(**parts), PoseSolver(**with_quality), observations[_SETTLED:]
-    )
+    return Recorded(problems, PoseSolver(**parts), observations[_SETTLED:])
 
 
 def main() -> None:

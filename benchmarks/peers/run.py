@@ -204,9 +204,7 @@ def main() -> None:
     version = subprocess.run(
         [program, "--version"], check=True, capture_output=True, text=True
     ).stdout
-    problems, solver, with_quality, _ = record_problems(
-        frames=arguments.frames, weights=arguments.weights
-    )
+    problems, solver, _ = record_problems(frames=arguments.frames, weights=arguments.weights)
     problem_file = arguments.folder / "problems.bin"
     write_problems(problems, problem_file)
     damping = solver.options.initial_damping
@@ -214,7 +212,6 @@ def main() -> None:
     everything = np.arange(len(problems))
     few = np.linspace(0, len(problems) - 1, arguments.scipy_frames).astype(int)
     peers = {
-        "fusecap, with quality per bone": lambda: fusecap_pass(with_quality, problems),
         **{
             name: partial(ceres_pass, program, problem_file, variant, CERES_DEFAULT_DAMPING)
             for variant, name in CERES.items()

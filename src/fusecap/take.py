@@ -28,9 +28,9 @@ from fusecap.body.skeleton import Skeleton
 from fusecap.errors import TakeError, nearest
 from fusecap.files import written_whole
 from fusecap.geometry.quaternions import from_wxyz, to_wxyz
-from fusecap.types import Estimate, Status
+from fusecap.types import Estimate, Status, quality_of
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 _FORMAT = f"fusecap take {FORMAT_VERSION}"
 
 UNITS = {
@@ -42,7 +42,8 @@ UNITS = {
     "local to its parent",
     "bone_position_in_world_m": "m, the joint at the bone's root",
     "bone_rotation_in_world_wxyz": "unit quaternion world_from_bone, w >= 0",
-    "bone_quality": "0-1",
+    "bone_sigma_deg": "deg, expected root mean square error of the bone's rotation in the world",
+    "position_sigma_m": "m, expected root mean square error of the joint's place",
     "world": "right-handed, y up, floor at y = 0",
 }
 
@@ -63,8 +64,10 @@ class Take:
     bone_position_in_world_m: Float[np.ndarray, "s t b 3"]
     bone_rotation_in_world_wxyz: Float[np.ndarray, "s t b 4"]
     tracked: Bool[np.ndarray, "s t"]
-    bone_quality: Float[np.ndarray, "s t b"]
-    """0-1; 0 where the pose is the prior's guess."""
+    bone_sigma_deg: Float[np.ndarray, "s t b"]
+    """Expected root mean square error of each bone's rotation in the world."""
+    position_sigma_m: Float[np.ndarray, "s t b"]
+    """Expected root mean square error of each joint's place in the cameras' world."""
     provenance: Mapping[str, Any] = field(default_factory=dict)
     """What made it: see `provenance`."""
 
@@ -79,7 +82,8 @@ class Take:
             "bone_position_in_world_m": (s, t, b, 3),
             "bone_rotation_in_world_wxyz": (s, t, b, 4),
             "tracked": (s, t),
-            "bone_quality": (s, t, b),
+            "bone_sigma_deg": (s, t, b),
+            "position_sigma_m": (s, t, b),
         }.items():
             found = np.shape(getattr(self, name))
             if found != shape:
@@ -98,7 +102,8 @@ class Take:
             "theta",
             "bone_position_in_world_m",
             "bone_rotation_in_world_wxyz",
-            "bone_quality",
+            "bone_sigma_deg",
+            "position_sigma_m",
         ):
             values = getattr(self, name)
             finite = np.isfinite(values).all(axis=tuple(range(2, values.ndim)))
@@ -121,6 +126,11 @@ class Take:
         return Skeleton(name=self.skeleton_name, bone_names=self.bone_names, parents=self.parents)
 
     @property
+    def bone_quality(self) -> Float[np.ndarray, "s t b"]:
+        """0-1, see `fusecap.types.quality_of`."""
+        return quality_of(self.bone_sigma_deg)
+
+    @property
     def time_s(self) -> Float[np.ndarray, " t"]:
         """Seconds since the first frame."""
         return (self.timestamps_ns - self.timestamps_ns[:1]) * 1e-9
@@ -141,7 +151,7 @@ class Take:
 
     def bone_rotation_in_world(self, subject: int) -> Float[np.ndarray, "t b 3 3"]:
         """Rotation matrices of one subject; NaN where untracked."""
-        matrices = np.full((*self.bone_quality[subject].shape, 3, 3), np.nan)
+        matrices = np.full((*self.bone_sigma_deg[subject].shape, 3, 3), np.nan)
         tracked = self.tracked[subject]
         quaternion = self.bone_rotation_in_world_wxyz[subject, tracked]
         matrices[tracked] = _matrix_from_wxyz(quaternion)
@@ -185,10 +195,10 @@ class TakeBuilder:
         self._rate_hz = rate_hz
         self._provenance = dict(provenance or {})
         self._timestamps_ns: list[int] = []
-        self._solved: dict[str, list[tuple[int, np.ndarray, np.ndarray]]] = {
+        self._solved: dict[str, list[tuple[int, np.ndarray, np.ndarray, np.ndarray]]] = {
             name: [] for name in subject_names
         }
-        """Per subject: frame, theta, bone quality."""
+        """Per subject: frame, theta, bone_sigma_deg, position_sigma_m."""
         self._shapes: dict[str, BodyShape] = {}
 
     def add(self, timestamp_ns: int, estimates: Iterable[Estimate]) -> None:
@@ -201,7 +211,8 @@ class TakeBuilder:
                 raise TakeError(f"two estimates of '{estimate.name}' at {timestamp_ns} ns")
             self._shapes[estimate.name] = estimate.shape
             if estimate.status is not Status.DIVERGED:
-                rows.append((frame, estimate.theta.copy(), estimate.bone_quality.copy()))
+                sigmas = estimate.bone_sigma_deg.copy(), estimate.position_sigma_m.copy()
+                rows.append((frame, estimate.theta.copy(), *sigmas))
 
     def build(self) -> Take:
         """What was added so far; subjects never seen have the reference shape and no frame."""
@@ -210,12 +221,13 @@ class TakeBuilder:
         reference = BodyShape.from_height(skeleton, REFERENCE_HEIGHT_M)
         shapes = [self._shapes.get(name, reference) for name in self._solved]
         theta = np.full((s, t, skeleton.pose_size), np.nan)
-        quality = np.full((s, t, b), np.nan)
+        bone_sigma_deg, position_sigma_m = np.full((2, s, t, b), np.nan)
         tracked = np.zeros((s, t), dtype=bool)
         for subject, rows in enumerate(self._solved.values()):
-            for frame, frame_theta, frame_quality in rows:
-                theta[subject, frame] = frame_theta
-                quality[subject, frame] = frame_quality
+            for frame, pose, turn, place in rows:
+                theta[subject, frame] = pose
+                bone_sigma_deg[subject, frame] = turn
+                position_sigma_m[subject, frame] = place
                 tracked[subject, frame] = True
         return take_from_theta(
             theta,
@@ -225,7 +237,8 @@ class TakeBuilder:
             subject_names=tuple(self._solved),
             skeleton=skeleton,
             tracked=tracked,
-            bone_quality=quality,
+            bone_sigma_deg=bone_sigma_deg,
+            position_sigma_m=position_sigma_m,
             provenance=self._provenance,
         )
 
@@ -239,15 +252,18 @@ def take_from_theta(
     subject_names: tuple[str, ...],
     skeleton: Skeleton,
     tracked: Bool[np.ndarray, "s t"] | None = None,
-    bone_quality: Float[np.ndarray, "s t b"] | None = None,
+    bone_sigma_deg: Float[np.ndarray, "s t b"] | None = None,
+    position_sigma_m: Float[np.ndarray, "s t b"] | None = None,
     provenance: Mapping[str, Any] | None = None,
 ) -> Take:
-    """A take of known poses; tracked everywhere and of quality 1 unless told."""
+    """A take of known poses; tracked everywhere and exact unless told."""
     s, t, b = len(subject_names), len(timestamps_ns), skeleton.bone_count
     if tracked is None:
         tracked = np.ones((s, t), dtype=bool)
-    if bone_quality is None:
-        bone_quality = np.ones((s, t, b))
+    if bone_sigma_deg is None:
+        bone_sigma_deg = np.zeros((s, t, b))
+    if position_sigma_m is None:
+        position_sigma_m = np.zeros((s, t, b))
     position = np.full((s, t, b, 3), np.nan)
     quaternion = np.full((s, t, b, 4), np.nan)
     for subject, shape in enumerate(shapes):
@@ -268,7 +284,8 @@ def take_from_theta(
         bone_position_in_world_m=position,
         bone_rotation_in_world_wxyz=quaternion,
         tracked=tracked,
-        bone_quality=bone_quality,
+        bone_sigma_deg=bone_sigma_deg,
+        position_sigma_m=position_sigma_m,
         provenance=dict(provenance or {}),
     )
 
@@ -289,7 +306,8 @@ def save_take(take: Take, path: Path | str) -> None:
         "bone_position_in_world_m": take.bone_position_in_world_m,
         "bone_rotation_in_world_wxyz": take.bone_rotation_in_world_wxyz,
         "tracked": take.tracked,
-        "bone_quality": take.bone_quality,
+        "bone_sigma_deg": take.bone_sigma_deg,
+        "position_sigma_m": take.position_sigma_m,
         "provenance": np.array(json.dumps(take.provenance, sort_keys=True, default=str)),
     }
     with written_whole(Path(path)) as file:
@@ -317,7 +335,10 @@ def load_take(path: Path | str) -> Take:
     if not found.startswith("fusecap take "):
         raise TakeError(f"{path} is not a take: it has no 'format' entry of fusecap")
     if found != _FORMAT:
-        raise TakeError(f"{path} is a '{found}', this version reads '{_FORMAT}'; update fusecap")
+        raise TakeError(
+            f"{path} is a '{found}', this version reads '{_FORMAT}'; solve it again, or use the "
+            "version of fusecap that wrote it"
+        )
     try:
         return _take_from_arrays(arrays)
     except KeyError as error:
@@ -340,7 +361,8 @@ def _take_from_arrays(arrays: Mapping[str, np.ndarray]) -> Take:
         bone_position_in_world_m=arrays["bone_position_in_world_m"].astype(np.float64),
         bone_rotation_in_world_wxyz=arrays["bone_rotation_in_world_wxyz"].astype(np.float64),
         tracked=arrays["tracked"].astype(bool),
-        bone_quality=arrays["bone_quality"].astype(np.float64),
+        bone_sigma_deg=arrays["bone_sigma_deg"].astype(np.float64),
+        position_sigma_m=arrays["position_sigma_m"].astype(np.float64),
         provenance=json.loads(str(arrays["provenance"])),
     )
 

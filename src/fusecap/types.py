@@ -57,6 +57,11 @@ class Observation:
     imu: ImuReading | None = None
 
 
+def quality_of(bone_sigma_deg: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """0-1, for colours and for programs that know no units: a half at 15 deg."""
+    return 1.0 / (1.0 + (bone_sigma_deg / 15.0) ** 2)
+
+
 class Status(enum.Enum):
     """How a solve ended."""
 
@@ -76,8 +81,10 @@ class Estimate:
     theta: Float[np.ndarray, " p"]
     bone_position_in_world_m: Float[np.ndarray, "b 3"]
     bone_rotation_in_world: Float[np.ndarray, "b 3 3"]
-    bone_quality: Float[np.ndarray, " b"]
-    """0-1: the share of a bone's orientation uncertainty under the prior that data removed."""
+    bone_sigma_deg: Float[np.ndarray, " b"]
+    """Expected root mean square error of each bone's rotation in the world."""
+    position_sigma_m: Float[np.ndarray, " b"]
+    """Expected root mean square error of each joint's place in the cameras' world."""
     shape: BodyShape
     status: Status
     iterations: int
@@ -86,6 +93,11 @@ class Estimate:
     """Wall time of the solve alone."""
     views: Bool[np.ndarray, " c"]
     """Which cameras contributed."""
+
+    @property
+    def bone_quality(self) -> Float[np.ndarray, " b"]:
+        """See `quality_of`."""
+        return quality_of(self.bone_sigma_deg)
 
 
 class TrackState(enum.Enum):

@@ -142,11 +142,12 @@ def recorded_take(recording: Recording, progress: Progress | None = None) -> Tak
     skeleton = session.skeleton
     reference = BodyShape.from_height(skeleton, REFERENCE_HEIGHT_M)
     theta = np.full((len(rows), len(times_ns), skeleton.pose_size), np.nan)
-    quality = np.full((len(rows), len(times_ns), skeleton.bone_count), np.nan)
+    turn, place = np.full((2, len(rows), len(times_ns), skeleton.bone_count), np.nan)
     for subject, poses in enumerate(rows.values()):
         for row, pose in poses:
             theta[subject, row] = pose.theta
-            quality[subject, row] = pose.bone_quality
+            turn[subject, row] = pose.bone_sigma_deg
+            place[subject, row] = pose.position_sigma_m
     return take_from_theta(
         theta,
         [shapes.get(name, reference) for name in rows],
@@ -155,7 +156,8 @@ def recorded_take(recording: Recording, progress: Progress | None = None) -> Tak
         subject_names=tuple(rows),
         skeleton=skeleton,
         tracked=np.asarray(np.isfinite(theta).all(axis=2)),
-        bone_quality=quality,
+        bone_sigma_deg=turn,
+        position_sigma_m=place,
         provenance=provenance(
             options={"recorded": True, "cameras": list(setup.rig.names)},
             simulated=setup.simulated,
@@ -193,5 +195,6 @@ def _same(recorded: RecordedPose, estimate: Estimate | None) -> bool:
         estimate is not None
         and recorded.timestamp_ns == estimate.timestamp_ns
         and recorded.theta.tobytes() == estimate.theta.tobytes()
-        and recorded.bone_quality.tobytes() == estimate.bone_quality.tobytes()
+        and recorded.bone_sigma_deg.tobytes() == estimate.bone_sigma_deg.tobytes()
+        and recorded.position_sigma_m.tobytes() == estimate.position_sigma_m.tobytes()
     )

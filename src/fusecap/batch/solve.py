@@ -18,7 +18,6 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float
 
 from fusecap.body.shape import BodyShape
 from fusecap.files import plain
@@ -27,7 +26,7 @@ from fusecap.progress import Progress
 from fusecap.setup import Setup, setup_of
 from fusecap.solve.estimator import Estimator
 from fusecap.solve.reprojection import Reprojection
-from fusecap.solve.whole_motion import AHEAD, PIECE, WholeMotion
+from fusecap.solve.whole_motion import AHEAD, PIECE, Settled, WholeMotion
 from fusecap.solve.window_solver import Workspace
 from fusecap.sources.session_data import SessionData
 from fusecap.take import Take, TakeBuilder, provenance
@@ -89,7 +88,7 @@ class SolveReport:
     duration_s: float
     cameras: int
     subjects: dict[str, dict[str, float]]
-    """Per subject: tracked_share (of all instants), mean_quality (0-1), height_m."""
+    """Per subject: tracked_share (of all instants), bone_sigma_deg, position_sigma_m, height_m."""
     reprojection_px: dict[str, dict[str, float]]
     """Per camera, in its own pixels: median, p90, and how many keypoints were used."""
     solve_ms_median: float
@@ -283,19 +282,21 @@ class _Motion:
         """What is held gets its last poses."""
         self._settle(self._motion.end())
 
-    def _settle(self, poses: Float[np.ndarray, "n p"]) -> None:
+    def _settle(self, settled: list[Settled]) -> None:
         name = self._estimator.model.name
-        for theta in poses:
+        for theta, sigmas in settled:
             instant = self._held.popleft()
             estimate, observation = instant.people[name]
             position, rotation = self._estimator.solver.posed(theta)
-            settled = replace(
+            last = replace(
                 estimate,
                 theta=theta,
                 bone_position_in_world_m=position,
                 bone_rotation_in_world=rotation,
+                bone_sigma_deg=sigmas.bone_deg,
+                position_sigma_m=sigmas.position_m,
             )
-            instant.people[name] = (settled, observation)
+            instant.people[name] = (last, observation)
             instant.held -= 1
 
 
@@ -360,9 +361,10 @@ def describe_subjects(take: Take) -> dict[str, dict[str, float]]:
 
 def _describe(take: Take, subject: int) -> dict[str, float]:
     tracked = take.tracked[subject]
-    quality = take.bone_quality[subject][tracked]
+    turn, place = take.bone_sigma_deg[subject, tracked], take.position_sigma_m[subject, tracked]
     return {
         "tracked_share": float(tracked.mean()) if tracked.size else 0.0,
-        "mean_quality": float(quality.mean()) if quality.size else 0.0,
+        "bone_sigma_deg": float(np.median(turn)) if turn.size else float("nan"),
+        "position_sigma_m": float(np.median(place)) if place.size else float("nan"),
         "height_m": float(take.heights_m[subject]),
     }

@@ -129,13 +129,14 @@ def print_report(report: LiveReport) -> None:
         f"{100 * report.cpu_share:.0f} % CPU, {report.memory_peak_mb:.0f} MB"
     )
     console.print(styled(simulated, text), soft_wrap=True)
-    people = table_of("person", "tracked", "measured", "quality")
+    people = table_of("person", "tracked", "measured", "bones +- deg", "joints +- mm")
     for name, subject in report.subjects.items():
         people.add_row(
             name,
             f"{100 * subject.tracked_share:.1f} %",
             f"{100 * subject.measured_share:.1f} %",
-            f"{subject.mean_quality:.2f}",
+            f"{subject.bone_sigma_deg:.1f}",
+            f"{1e3 * subject.position_sigma_m:.0f}",
         )
     if report.subjects:
         console.print(people)

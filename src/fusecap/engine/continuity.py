@@ -14,7 +14,7 @@ turns about its joint at 40 rad/s moves a wrist or ankle 0.4 m away at 16 m/s. T
 from two views or more, ten times its standard deviation, is on top. At 60 instants per second that
 is 0.25 m of the root, 0.47 m of any joint, and 0.87 rad of a bone.
 
-Whom nothing measures holds the last pose while its quality fades.
+Whom nothing measures holds the last pose while its error bars grow.
 """
 
 from __future__ import annotations
@@ -28,14 +28,13 @@ from scipy.spatial.transform import Rotation
 
 from fusecap.body.pose import forward_kinematics
 from fusecap.body.shape import BodyShape
+from fusecap.solve.uncertainty import Sigmas, grown
 from fusecap.types import Estimate
 
 BLEND_S = 0.3
 """In which an offset goes: a third of a second of wrong pose is hardly seen, a jump is."""
 BLEND_SPEED_M_S = 6.0
 """A root with farther to go takes longer: nobody is carried faster than people run."""
-FADE_S = 2.0
-"""After which a pose that nothing measures has no quality left."""
 ROOT_SPEED_M_S, JOINT_SPEED_M_S, PLACE_NOISE_M = 12.0, 25.0, 0.05
 BONE_SPEED_RAD_S, BONE_NOISE_RAD = 40.0, 0.2
 SHAPE_STEP_M = 0.005
@@ -104,10 +103,13 @@ class Continuity:
             self._estimate = self._solved = self._sent = self._sent_before = self._offset = None
             return None
         self._held = True
+        known = Sigmas(self._estimate.bone_sigma_deg, self._estimate.position_sigma_m)
+        sigmas = grown(known, silent_s)
         return replace(
             self._estimate,
             timestamp_ns=now_ns,
-            bone_quality=self._estimate.bone_quality * remaining(np.array(silent_s / FADE_S)),
+            bone_sigma_deg=sigmas.bone_deg,
+            position_sigma_m=sigmas.position_m,
             views=np.zeros_like(self._estimate.views),
             iterations=0,
             solve_s=0.0,
@@ -258,4 +260,4 @@ def _too_fast(pose: _Pose, last: _Pose) -> np.ndarray:
 
 
 def _is_finite(estimate: Estimate) -> bool:
-    return bool(np.isfinite(estimate.theta).all() and np.isfinite(estimate.bone_quality).all())
+    return bool(np.isfinite(estimate.theta).all())

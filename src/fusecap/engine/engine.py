@@ -51,7 +51,7 @@ class LiveStep:
     step: Step
     """As sorted and solved."""
     people: Mapping[str, Estimate | None]
-    """Every subject in a lasting order, without jumps and with a quality that fades where nothing
+    """Every subject in a lasting order, without jumps and with error bars that grow where nothing
     measures; None while there is no pose to send."""
 
 

@@ -35,8 +35,8 @@ def errors_over_time(take: Take, truth: Take, *, gate_m: float = 0.5) -> ErrorsO
     position_mm, orientation_deg = {}, {}
     for person, name in enumerate(take.subject_names):
         rotation = take.bone_rotation_in_world(person)[rows]
-        millimetres = np.full(take.bone_quality.shape[1:], np.nan)
-        degrees = np.full(take.bone_quality.shape[1:], np.nan)
+        millimetres = np.full(take.bone_sigma_deg.shape[1:], np.nan)
+        degrees = np.full(take.bone_sigma_deg.shape[1:], np.nan)
         for true_person, matched in enumerate(match == person):
             at = rows[matched]
             millimetres[at] = 1e3 * position_error_m(

@@ -189,7 +189,7 @@ def same_instants(
 
 
 def _rotations(take: Take) -> Float[np.ndarray, "s t b 3 3"]:
-    rotation = np.full((*take.bone_quality.shape, 3, 3), np.nan)
+    rotation = np.full((*take.bone_sigma_deg.shape, 3, 3), np.nan)
     for subject in range(len(rotation)):
         rotation[subject] = take.bone_rotation_in_world(subject)
     return rotation

@@ -49,22 +49,24 @@ def live_takes(
     setup = setup_of_simulation(simulation, options=options, associate=associate)
     pipeline, instants = Pipeline(setup), _Instants(simulation)
     times_ns: list[int] = []
-    newest: dict[int, list[Estimate]] = {}
-    settled: dict[int, list[Estimate]] = {}
+    newest: dict[int, dict[str, Estimate]] = {}
+    settled: dict[int, dict[str, Estimate]] = {}
     for instant in range(len(instants)):
         step = pipeline.step(instants.detections(instant), instants.readings(instant))
         times_ns.append(simulation.detections[instant].timestamp_ns)
-        newest[times_ns[-1]] = list(step.estimates)
+        newest[times_ns[-1]] = {estimate.name: estimate for estimate in step.estimates}
         for estimate in step.estimates:
             late = pipeline.estimator(estimate.name).settled(lag_s)
             if late is not None:
-                settled.setdefault(late.timestamp_ns, []).append(late)
+                settled.setdefault(late.timestamp_ns, {})[late.name] = late
         if progress:
             progress("solving as live", instant + 1, len(instants))
     return _take(setup, times_ns, newest), _take(setup, times_ns, settled)
 
 
-def _take(setup: Setup, times_ns: list[int], estimates: Mapping[int, list[Estimate]]) -> Take:
+def _take(
+    setup: Setup, times_ns: list[int], estimates: Mapping[int, Mapping[str, Estimate]]
+) -> Take:
     builder = TakeBuilder(
         skeleton=setup.skeleton,
         rate_hz=setup.rate_hz,
@@ -72,7 +74,7 @@ def _take(setup: Setup, times_ns: list[int], estimates: Mapping[int, list[Estima
         provenance=provenance(options={"solver": asdict(setup.options)}, simulated=True),
     )
     for timestamp_ns in times_ns:
-        builder.add(timestamp_ns, estimates.get(timestamp_ns, []))
+        builder.add(timestamp_ns, estimates.get(timestamp_ns, {}).values())
     return builder.build()
 
 

@@ -40,7 +40,7 @@ def _products(a, b, i, j, length, out):
 
 
 @kernel(boolean(_MATRIX, _MATRIX))
-def _factor(block, square):
+def factor(block, square):
     """L of a symmetric block's lower triangle, in its place; False where it is not positive."""
     size = block.shape[0]
     for i in range(0, size, 3):
@@ -61,7 +61,7 @@ def _factor(block, square):
 
 
 @kernel(void(_MATRIX, _MATRIX, _MATRIX))
-def _divide(block, lower, square):
+def divide(block, lower, square):
     """Block L^-T, in its place."""
     size = block.shape[0]
     for i in range(0, size, 3):
@@ -76,7 +76,7 @@ def _divide(block, lower, square):
 
 
 @kernel(void(_MATRIX, _MATRIX, _MATRIX, boolean, _MATRIX))
-def _subtract(block, a, b, lower_only, square):
+def subtract(block, a, b, lower_only, square):
     """Block -= a bᵀ, where `lower_only` on and below the diagonal only."""
     size = block.shape[0]
     for i in range(0, size, 3):
@@ -100,7 +100,7 @@ def eliminate(hessian, gradient, count, damping, ridge, square):
             hessian[t, 0, i, i] += damping * max(hessian[t, 0, i, i], 1e-6) + ridge
     for t in range(count):
         own = hessian[t, 0]
-        if not _factor(own, square):
+        if not factor(own, square):
             return False
         for i in range(size):
             value = gradient[t, i]
@@ -109,15 +109,15 @@ def eliminate(hessian, gradient, count, damping, ridge, square):
             gradient[t, i] = value / own[i, i]
         for k in range(1, min(3, total - t)):
             block = hessian[t + k, k]
-            _divide(block, own, square)
+            divide(block, own, square)
             for i in range(size):
                 value = 0.0
                 for j in range(size):
                     value += block[i, j] * gradient[t, j]
                 gradient[t + k, i] -= value
-            _subtract(hessian[t + k, 0], block, block, True, square)
+            subtract(hessian[t + k, 0], block, block, True, square)
         if t + 2 < total:
-            _subtract(hessian[t + 2, 1], hessian[t + 2, 2], hessian[t + 1, 1], False, square)
+            subtract(hessian[t + 2, 1], hessian[t + 2, 2], hessian[t + 1, 1], False, square)
     return True
 
 

@@ -27,8 +27,10 @@ class SubjectReport:
     """Of instants: with a pose to send."""
     measured_share: float
     """Of instants: with a pose that was solved, not held."""
-    mean_quality: float
-    """Over bones and the instants with a pose."""
+    bone_sigma_deg: float
+    """Expected error of bones' rotations: mean over instants with a pose of the median bone."""
+    position_sigma_m: float
+    """The same of joints' places."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,7 +90,8 @@ def subject_reports(people: Mapping[str, PersonTally], instants: int) -> dict[st
         name: SubjectReport(
             tracked_share=tally.instants / max(instants, 1),
             measured_share=tally.measured / max(instants, 1),
-            mean_quality=tally.quality / max(tally.instants, 1),
+            bone_sigma_deg=tally.bone_sigma_deg / max(tally.instants, 1),
+            position_sigma_m=tally.position_sigma_m / max(tally.instants, 1),
         )
         for name, tally in people.items()
     }

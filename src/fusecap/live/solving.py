@@ -68,8 +68,9 @@ class PersonTally:
     """With a pose to send."""
     measured: int = 0
     """With a pose that was solved, not held."""
-    quality: float = 0.0
-    """Sum over instants of the mean over bones."""
+    bone_sigma_deg: float = 0.0
+    """Sum over instants of the median over bones; so is the next."""
+    position_sigma_m: float = 0.0
 
 
 class Solving:
@@ -218,4 +219,5 @@ class Solving:
             tally = self.people.setdefault(name, PersonTally())
             tally.instants += 1
             tally.measured += name in measured
-            tally.quality += float(estimate.bone_quality.mean())
+            tally.bone_sigma_deg += float(np.median(estimate.bone_sigma_deg))
+            tally.position_sigma_m += float(np.median(estimate.position_sigma_m))

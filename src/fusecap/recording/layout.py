@@ -94,7 +94,9 @@ def pose_message(estimate: Estimate) -> str:
         f'"iterations":{estimate.iterations},"cost":{_numbers(np.float64(estimate.cost))},'
         f'"solve_s":{_numbers(np.float64(estimate.solve_s))},'
         f'"views":{json.dumps(estimate.views.tolist())},'
-        f'"theta":{_numbers(estimate.theta)},"bone_quality":{_numbers(estimate.bone_quality)},'
+        f'"theta":{_numbers(estimate.theta)},'
+        f'"bone_sigma_deg":{_numbers(estimate.bone_sigma_deg)},'
+        f'"position_sigma_m":{_numbers(estimate.position_sigma_m)},'
         f'"position_m":{_numbers(np.round(estimate.bone_position_in_world_m, 6))},'
         f'"rotation_wxyz":{_numbers(np.round(wxyz, 7))}}}'
     )
@@ -172,7 +174,8 @@ SCHEMAS = {
             solve_s=_NUMBER,
             views=_list({"type": "boolean"}, "Which cameras contributed"),
             theta=_list(_NUMBER, "Root translation [m], then an angle-axis vector [rad] per bone"),
-            bone_quality=_list(_NUMBER, "0-1"),
+            bone_sigma_deg=_list(_NUMBER, "Expected error of each bone's rotation"),
+            position_sigma_m=_list(_NUMBER, "Expected error of each joint's place"),
             position_m=_list(_ROW, "Per bone, the joint at its root"),
             rotation_wxyz=_list(_ROW, "Per bone, world_from_bone"),
         ),
@@ -228,7 +231,8 @@ def _pose(values: Mapping[str, Any], known: Known) -> dict[str, Any]:
         "name": str(values["name"]),
         "timestamp_ns": _time_ns(values),
         "theta": _floats(values["theta"], skeleton.pose_size),
-        "bone_quality": _floats(values["bone_quality"], skeleton.bone_count),
+        "bone_sigma_deg": _floats(values["bone_sigma_deg"], skeleton.bone_count),
+        "position_sigma_m": _floats(values["position_sigma_m"], skeleton.bone_count),
         "diverged": values["status"] == "diverged",
     }
 

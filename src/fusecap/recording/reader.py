@@ -70,7 +70,8 @@ class RecordedPose:
     """Of the tick it belongs to, among all events."""
     timestamp_ns: int
     theta: Float[np.ndarray, " p"]
-    bone_quality: Float[np.ndarray, " b"]
+    bone_sigma_deg: Float[np.ndarray, " b"]
+    position_sigma_m: Float[np.ndarray, " b"]
     diverged: bool
 
 

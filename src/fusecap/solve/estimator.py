@@ -31,6 +31,7 @@ from fusecap.solve.initialize import (
 )
 from fusecap.solve.options import SolverOptions
 from fusecap.solve.pose_solver import ImuSites, Measurements, PoseSolver, Solution
+from fusecap.solve.uncertainty import grown, sigmas, turn_shares, unknown
 from fusecap.solve.window_solver import WindowSolver
 from fusecap.types import Estimate, Observation, Status
 
@@ -94,6 +95,9 @@ class Estimator:
         self._motion = WindowSolver(self.solver, self.solver.options.window) if together else None
         self._recent: deque[Estimate] = deque(maxlen=self.solver.options.window)
         """Those of the instants in the window, as they were when new."""
+        self._turn_shares = turn_shares(skeleton)
+        self._sigmas = unknown(skeleton)
+        self._measured_ns = 0
         self._solution: Solution | None = None
         self._previous: Observation | None = None
         self._sites: list[np.ndarray] = []
@@ -150,7 +154,7 @@ class Estimator:
 
         `landmarks_in_world_m` (NaN = missing) are triangulated landmarks of this instant: they
         measure the body, place the first pose, and offer a second start when a solve ends badly.
-        With neither keypoints nor IMUs the pose is held and its quality is 0.
+        With neither keypoints nor IMUs the pose is held and its error bars grow.
         """
         self._last_ns = observation.timestamp_ns
         if landmarks_in_world_m is None:
@@ -177,7 +181,13 @@ class Estimator:
             solution = self._in_window(self._motion, observation, data, solution)
         solve_s = time.perf_counter() - started
         self._remember(observation, solution)
+        if self._motion is not None and self._motion.count > 2:
+            spread = self._motion.newest_spread()
+        else:
+            spread = self.solver.spread()
+        self._sigmas = sigmas(*spread, self._turn_shares)
         estimate = self._estimate(observation.timestamp_ns, solution, views, solve_s)
+        self._measured_ns = observation.timestamp_ns
         if sound:
             self._recent.append(estimate)
         return estimate
@@ -326,8 +336,11 @@ class Estimator:
     def _held(self, timestamp_ns: int, last: Solution, views: np.ndarray) -> Estimate:
         """The last pose again; accelerations must not reach across the gap."""
         self._sites = []
-        held = replace(last, bone_quality=np.zeros_like(last.bone_quality))
-        return self._estimate(timestamp_ns, held, views, 0.0)
+        known = self._sigmas
+        self._sigmas = grown(known, (timestamp_ns - self._measured_ns) * 1e-9)
+        held = self._estimate(timestamp_ns, last, views, 0.0)
+        self._sigmas = known
+        return held
 
     def _estimate(
         self, timestamp_ns: int, solution: Solution, views: Bool[np.ndarray, " c"], solve_s: float
@@ -339,7 +352,8 @@ class Estimator:
             theta=solution.theta,
             bone_position_in_world_m=solution.position_in_world_m,
             bone_rotation_in_world=solution.rotation_in_world,
-            bone_quality=solution.bone_quality,
+            bone_sigma_deg=self._sigmas.bone_deg,
+            position_sigma_m=self._sigmas.position_m,
             shape=self.solver.shape,
             status=solution.status,
             iterations=solution.iterations,

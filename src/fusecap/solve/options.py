@@ -97,8 +97,6 @@ class SolverOptions:
     """Instants that a live pose is solved together with, itself among them; 1: each alone."""
     floor_radius_m: float = 0.05
     """Distance kept between the floor and the ankle and toe joints [1, eq. 16]."""
-    quality: bool = True
-    """Compute the per-bone quality after each solve (about a quarter of a solve's time)."""
 
     def __post_init__(self) -> None:
         if self.max_iterations < 1:

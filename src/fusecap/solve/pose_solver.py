@@ -12,7 +12,7 @@ from fusecap.body.prior import PosePrior
 from fusecap.body.shape import BodyShape
 from fusecap.errors import InputError
 from fusecap.geometry.camera import Rig
-from fusecap.kernels import cholesky, groups
+from fusecap.kernels import band, groups, uncertainty
 from fusecap.kernels import solve as kernels
 from fusecap.kernels.kinematics import forward
 from fusecap.solve.options import SolverOptions
@@ -20,8 +20,8 @@ from fusecap.types import Status
 
 _FLOOR_BONES = ("left_foot", "left_toes", "right_foot", "right_toes")
 _NEAR_M = 0.5
-_ROOT_PRIOR_VARIANCE = np.pi**2
-"""Per axis [rad²], of a root that could face anywhere: what its quality is measured against."""
+UNKNOWN_RIDGE = 1e-3
+"""Of the normal equations, [1/rad², 1/m²]: nothing is farther off than half a turn or 30 m."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +59,6 @@ class Solution:
     theta: Float[np.ndarray, " p"]
     position_in_world_m: Float[np.ndarray, "b 3"]
     rotation_in_world: Float[np.ndarray, "b 3 3"]
-    bone_quality: Float[np.ndarray, " b"]
     status: Status
     iterations: int
     cost: float
@@ -108,7 +107,6 @@ class PoseSolver:
             radius=self.options.floor_radius_m,
             resting=np.array([*feet, 0], dtype=np.int64),
         )
-        self._prior_variance = self._variance_under_prior(prior)
         n, b = skeleton.pose_size, skeleton.bone_count
         self._posed = groups.Posed(
             position=np.zeros((b, 3)), rotation=np.zeros((b, 3, 3)), twist=np.zeros((b, 3, 3))
@@ -125,6 +123,8 @@ class PoseSolver:
         self._gradient = np.zeros((2, n))
         self._lower = np.zeros((n, n))
         self._inverse = np.zeros((n, n))
+        self._covariances = np.zeros((uncertainty.ROOM, n, n))
+        self._chain = np.zeros((6, n))
         self._vectors = (np.zeros(n), np.zeros(n), np.zeros(n))
         self.set_shape(shape)
 
@@ -172,7 +172,6 @@ class PoseSolver:
             theta=result,
             position_in_world_m=self._posed.position.copy(),
             rotation_in_world=self._posed.rotation.copy(),
-            bone_quality=self._quality() if options.quality else np.ones(self.skeleton.bone_count),
             status=Status(status),
             iterations=iterations,
             cost=cost,
@@ -251,23 +250,17 @@ class PoseSolver:
         """(1 + B,) of the root's place and every joint: one over their mean square acceleration."""
         return self._acceleration**-2.0
 
-    def _quality(self) -> np.ndarray:
-        """1 - posterior / prior variance per bone, from the Gauss-Newton matrix at the solution."""
-        size = len(self._gradient[0])
-        ridge = np.full(size, 1e-9)
-        ridge[3:6] = 1 / _ROOT_PRIOR_VARIANCE
-        if not cholesky.factor(self._hessian[0], ridge, self._lower):
-            return np.zeros(self.skeleton.bone_count)
-        posterior = self._vectors[0]
-        cholesky.inverse_diagonal(self._lower, self._inverse, posterior)
-        per_bone = posterior[3:].reshape(-1, 3).sum(axis=1)
-        return np.clip(1 - per_bone / self._prior_variance, 0.0, 1.0)
+    def spread(self) -> tuple[Float[np.ndarray, " b"], Float[np.ndarray, " b"]]:
+        """Traces [rad², m²] of what the last solve, alone, says of bones' turns and joints.
 
-    def _variance_under_prior(self, prior: PosePrior) -> np.ndarray:
-        """Trace of each bone's covariance when nothing is measured, from the PCA terms."""
-        weights = self.options.weights
-        projection, deviation = max(weights.projection, 1e-3), max(weights.deviation, 1e-3)
-        outside = np.diag(prior.projector) / projection
-        inside = np.einsum("ij,j,ij->i", prior.basis, prior.sigma**2, prior.basis) / deviation
-        root = [3 * _ROOT_PRIOR_VARIANCE]
-        return np.concatenate([root, (outside + inside).reshape(-1, 3).sum(axis=1)])
+        NaN where its matrix is not positive.
+        """
+        turn, place = np.full((2, self.skeleton.bone_count), np.nan)
+        lower, square = self._hessian[1], self._scratch.local
+        lower[:] = self._hessian[0] + UNKNOWN_RIDGE * np.eye(len(lower))
+        if band.factor(lower, square):
+            uncertainty.newest(lower, self._inverse, self._covariances, square)
+            uncertainty.spread(
+                self.model.body, self._posed, self._inverse, self._chain, turn, place
+            )
+        return turn, place

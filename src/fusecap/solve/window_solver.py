@@ -12,18 +12,19 @@ import numpy as np
 from jaxtyping import Float
 
 from fusecap.body.skeleton import Skeleton
-from fusecap.kernels import band, groups, window
+from fusecap.kernels import band, groups, uncertainty, window
 from fusecap.kernels.jit import FINITE
 from fusecap.kernels.lie import wrap_pose
 from fusecap.solve.contact import Contact
-from fusecap.solve.pose_solver import PoseSolver
+from fusecap.solve.pose_solver import UNKNOWN_RIDGE, PoseSolver
 from fusecap.types import GRAVITY_M_S2, Observation
 
 LONGEST_STEP_S = 0.1
 """Longer gaps are not bridged: the motion ends and begins anew."""
 EXACT_S = 1e-3
 """Within which an instant is as old as asked for: clocks round."""
-_DAMPING, _LEAST_DAMPING, _MAX_DAMPING = 1e-4, 1e-8, 1e6
+_DAMPING, _LEAST_DAMPING, _MAX_DAMPING = 1e-8, 1e-10, 1e6
+"""So little at first that the newest instant's matrix is its information."""
 _KEPT_PROMISE = 0.5
 """Of two steps that were needed, nearly all have a first one farther than this from its promise."""
 _UP_M_S2 = np.array([0.0, GRAVITY_M_S2, 0.0])
@@ -47,6 +48,8 @@ class Workspace:
         )
         self.motions = np.zeros((n, b, 6, 3))
         self.lever, self.square = np.zeros((3, 3, 6)), np.zeros((10, 3, 3))
+        self.covariances = np.zeros((uncertainty.ROOM, p, p))
+        self.chain = np.zeros((6, p))
         self.hessian, self.gradient = np.zeros((n, 3, p, p)), np.zeros((n, p))
 
 
@@ -80,6 +83,10 @@ class WindowSolver:
             solver.sites,
             has_floor=solver.options.weights.floor > 0.0,
         )
+        p = solver.skeleton.pose_size
+        self._newest = np.zeros((p, p))
+        """L of the newest instant, after the last step."""
+        self._covariance = np.zeros((p, p))
         self._prior: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
         """What those that left say of the two oldest: H (2, 3, P, P), g (2, P), both at (2, P)."""
 
@@ -140,6 +147,7 @@ class WindowSolver:
             if not cost < FINITE or damping > _MAX_DAMPING:
                 break
             positive = band.eliminate(hessian, gradient, n, damping, _RIDGE, workspace.square[0])
+            self._newest[:] = hessian[n - 1, 0]
             promised = 0.5 * float(np.vdot(gradient, gradient))
             trial_cost = np.inf
             if positive:
@@ -191,6 +199,37 @@ class WindowSolver:
         theta = self._theta[self.count - 1 - back].copy()
         wrap_pose(theta)
         return theta
+
+    def newest_spread(self) -> tuple[Float[np.ndarray, " b"], Float[np.ndarray, " b"]]:
+        """Traces [rad², m²] of what is known of the newest instant's bones and joints."""
+        workspace, square = self._workspace, self._workspace.square[0]
+        uncertainty.newest(self._newest, self._covariance, workspace.covariances, square)
+        return self._spread(self.count - 1)
+
+    def spreads(self, count: int) -> tuple[Float[np.ndarray, "n b"], Float[np.ndarray, "n b"]]:
+        """The same of the oldest instants, by all that the window holds."""
+        workspace, square, n = self._workspace, self._workspace.square[0], self.count
+        hessian, gradient = workspace.hessian[:n], workspace.gradient[:n]
+        turn, place = np.full((2, n, self._solver.skeleton.bone_count), np.nan)
+        self._evaluate(self._theta[:n])
+        if band.eliminate(hessian, gradient, n, 0.0, UNKNOWN_RIDGE, square):
+            for t in range(n - 1, -1, -1):
+                uncertainty.step_back(hessian, t, workspace.covariances, self._covariance, square)
+                turn[t], place[t] = self._spread(t)
+        return turn[:count], place[:count]
+
+    def _spread(self, row: int) -> tuple[Float[np.ndarray, " b"], Float[np.ndarray, " b"]]:
+        workspace = self._workspace
+        turn, place = np.zeros((2, self._solver.skeleton.bone_count))
+        uncertainty.spread(
+            self._solver.model.body,
+            groups.Posed(*(array[row] for array in workspace.posed)),
+            self._covariance,
+            workspace.chain,
+            turn,
+            place,
+        )
+        return turn, place
 
     def back(self, lag_s: float) -> int | None:
         """How many instants before the newest is the first at least `lag_s` old; None: no one.

@@ -333,8 +333,8 @@ class LiveSettings(_Table):
     """Solve as soon as every source has what an instant needs, at the latest after the delay;
     None: where keypoints come from outside."""
     hold_s: NotNegative = 10.0
-    """How long a person whom nothing measures is still sent, in the last pose and with fading
-    quality."""
+    """How long a person whom nothing measures is still sent, in the last pose and with growing
+    error bars."""
 
 
 class Session(_Table):

@@ -31,12 +31,11 @@ class BoneCurve:
     """Of the axis; None: of the data."""
 
 
-def quality_curve(take: Take) -> BoneCurve:
-    """0-1; the share of a bone's orientation uncertainty that data removed."""
+def sigma_curve(take: Take) -> BoneCurve:
+    """How sure each bone's rotation is."""
     return BoneCurve(
-        title="bone quality (0 to 1)",
-        by_person=dict(zip(take.subject_names, take.bone_quality, strict=True)),
-        top=1.03,
+        title="expected bone error (deg)",
+        by_person=dict(zip(take.subject_names, take.bone_sigma_deg, strict=True)),
     )
 
 

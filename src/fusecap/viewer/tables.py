@@ -53,7 +53,7 @@ def lights(sources: Sequence[SourceStatus]) -> str:
 
 
 def people(step: LiveStep, colours: Mapping[str, Rgb]) -> str:
-    """A line per subject: how it is followed and how much of its pose is measured."""
+    """A line per subject: how it is followed and how sure its pose is."""
     state = {update.name: update.state for update in step.step.updates}
     lines = []
     for name, estimate in step.people.items():
@@ -63,7 +63,10 @@ def people(step: LiveStep, colours: Mapping[str, Rgb]) -> str:
             followed = state.get(name)
             seen = f"in {int(estimate.views.sum())} views"
             how = "unseen, held" if followed in (None, TrackState.COASTING) else seen
-            how += f", quality {float(estimate.bone_quality.mean()):.2f}"
+            how += (
+                f", &plusmn;{float(np.median(estimate.bone_sigma_deg)):.0f} deg, "
+                f"&plusmn;{1e3 * float(np.median(estimate.position_sigma_m)):.0f} mm"
+            )
         dot = f'<span style="color:{css(colours[name])};font-size:1.3em">&#9679;</span>'
         lines.append(f"<div>{dot} <b>{escaped(name)}</b>: {how}</div>")
     return f'<div style="{_SMALL}">{"".join(lines) or "nobody yet"}</div>'

@@ -13,7 +13,7 @@ from fusecap.errors import TakeError
 from fusecap.geometry.camera import Rig
 from fusecap.take import Take
 from fusecap.viewer.controls import PlaybackControls
-from fusecap.viewer.curves import ALL_BONES, BoneCurve, Plot, quality_curve
+from fusecap.viewer.curves import ALL_BONES, BoneCurve, Plot, sigma_curve
 from fusecap.viewer.figure import Pose
 from fusecap.viewer.page import Page
 from fusecap.viewer.palette import css, escaped, person_rgb
@@ -61,7 +61,7 @@ class TakePage:
         everywhere = places_of(list(take.bone_position_in_world_m[:, :, 0]))
         add_view_controls(page, room, lambda: everywhere)
         self._views = detections and RecordedViews(page.gui, detections, colours)
-        self._plots = self._add_plots([quality_curve(take), *curves], colours)
+        self._plots = self._add_plots([sigma_curve(take), *curves], colours)
         self._drawn: tuple[int, tuple[bool, ...]] | None = None
         self._draw(0, 0.0, plots=True)
 

@@ -324,7 +324,8 @@ def _one_frame(take: Take, frame: int) -> Take:
         bone_position_in_world_m=take.bone_position_in_world_m[:, only],
         bone_rotation_in_world_wxyz=take.bone_rotation_in_world_wxyz[:, only],
         tracked=take.tracked[:, only],
-        bone_quality=take.bone_quality[:, only],
+        bone_sigma_deg=take.bone_sigma_deg[:, only],
+        position_sigma_m=take.position_sigma_m[:, only],
     )
 
 
