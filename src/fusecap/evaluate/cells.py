@@ -65,7 +65,7 @@ class TwinCell:
     live: bool = False
     """Also score what a live run has: the newest pose, and one settled for `LATE_S`."""
     trace: bool = False
-    """Return the height and depth of the root over time as well."""
+    """Return the places of the root and of a wrist over time as well."""
 
 
 def solve_cell(cell: TwinCell) -> dict[str, Any]:
@@ -91,6 +91,10 @@ def solve_cell(cell: TwinCell) -> dict[str, Any]:
     if cell.trace:
         result["root_m"] = np.round(solved.take.theta[0, :, :3], 5).tolist()
         result["true_root_m"] = np.round(simulation.truth.theta[0, :, :3], 5).tolist()
+        wrist = simulation.truth.bone_names.index("right_hand")
+        for name, take in (("wrist_m", solved.take), ("true_wrist_m", simulation.truth)):
+            place = take.bone_position_in_world_m[0, :, wrist]
+            result[name] = np.round(place, 5).tolist()
     return plain(result)
 
 

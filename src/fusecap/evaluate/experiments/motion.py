@@ -9,6 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from itertools import pairwise
 
+import numpy as np
+from matplotlib.figure import Figure
+
 from fusecap.evaluate.cells import LATE_S, TwinCell
 from fusecap.evaluate.experiments.experiment import (
     Claim,
@@ -35,6 +38,8 @@ ERRORS = {
     "jitter km/s3": ("jitter_km_s3",),
     "foot skate m/s": ("foot_skate_m_s",),
 }
+SHOWN = 240
+"""Frames of the plots."""
 TRUTHS = {"jitter km/s3": "true_jitter_km_s3", "foot skate m/s": "true_foot_skate_m_s"}
 
 
@@ -45,7 +50,9 @@ def _inputs(settings: Settings) -> tuple[tuple[int, int], ...]:
 def _row(settings: Settings, cameras: int, imus: int, *, alone: bool) -> list[TwinCell]:
     between = dict.fromkeys(BETWEEN, 0.0) if alone else {}
     return [
-        settings.cell(scene, cameras=cameras, imus=imus, live=not alone, weights=between)
+        settings.cell(
+            scene, cameras=cameras, imus=imus, live=not alone, weights=between, trace=True
+        )
         for scene in settings.sequences
     ]
 
@@ -76,7 +83,36 @@ def report(settings: Settings, results: Results) -> Report:
         tables.append(
             Table(title=title, columns=("input", *COLUMNS, *truth), rows=tuple(rows), digits=digits)
         )
-    return Report(tables=tuple(tables), findings=tuple(_findings(settings, results)))
+    return Report(
+        tables=tuple(tables),
+        findings=tuple(_findings(settings, results)),
+        plots={"": _plot(settings, results)},
+    )
+
+
+def _plot(settings: Settings, results: Results) -> Figure:
+    """Heights of the root and of a wrist over two seconds, before and after."""
+    inputs = _inputs(settings)
+    figure = Figure(figsize=(12, 3 * len(inputs)), layout="constrained")
+    grid = figure.subplots(len(inputs), 2, squeeze=False)
+    for row, (cameras, imus) in zip(grid, inputs, strict=True):
+        before, after = (
+            results.of(_row(settings, cameras, imus, alone=alone)[0]) for alone in (True, False)
+        )
+        for ax, joint in zip(row, ("root", "wrist"), strict=True):
+            for what, result, key, colour in (
+                ("alone", before, f"{joint}_m", "0.7"),
+                ("together", after, f"{joint}_m", "C0"),
+                ("truth", after, f"true_{joint}_m", "k"),
+            ):
+                if result is not None and key in result:
+                    height_m = [np.nan if at[1] is None else at[1] for at in result[key][:SHOWN]]
+                    ax.plot(np.arange(len(height_m)) / 60.0, height_m, colour, label=what, lw=1)
+            ax.set_title(f"{settings.sequences[0]}, {_named(cameras, imus)}: {joint}", fontsize=9)
+            ax.set_ylabel("height m")
+    grid[0, 0].legend(fontsize=8)
+    grid[-1, 0].set_xlabel("s")
+    return figure
 
 
 def _findings(settings: Settings, results: Results) -> Iterator[Claim]:
