@@ -24,7 +24,7 @@ from fusecap.solve.window_solver import WindowSolver
 MAGIC = 20202.0
 REACHED = 1e-4
 """A window is solved when its cost is within this share of the minimum."""
-DAMPING = 1e-8
+DAMPING = 1e-4
 _STEPS = 50
 
 
@@ -95,7 +95,7 @@ class Windows:
                 damping *= 10.0
                 self.evaluate(w, theta)
                 continue
-            theta, cost, damping = trial, trial_cost, max(damping / 10.0, 1e-10)
+            theta, cost, damping = trial, trial_cost, max(damping / 10.0, 1e-8)
         return Solved(theta=theta, cost=cost, solves=solves)
 
 

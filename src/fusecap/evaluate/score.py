@@ -52,6 +52,10 @@ class TakeScore:
     """Mean per bone."""
     bone_orientation_error_deg: dict[str, float]
     bone_axial_error_deg: dict[str, float]
+    bone_orientation_variance_ratio: dict[str, float]
+    """Per bone its mean squared error over its mean variance, as the take has it; NaN where that is
+    none. 1: the error bars are true."""
+    bone_position_variance_ratio: dict[str, float]
     acceleration_error_m_s2: float
     """Mean over joints and frames."""
     jitter_km_s3: float
@@ -119,6 +123,12 @@ def score_take(take: Take, truth: Take, *, gate_m: float = 0.5) -> TakeScore:
         bone_position_error_mm=_per_bone(take, position_mm),
         bone_orientation_error_deg=_per_bone(take, orientation_deg),
         bone_axial_error_deg=_per_bone(take, axial_deg),
+        bone_orientation_variance_ratio=_ratio(
+            take, orientation_deg, take.bone_sigma_deg[found, rows[frame]]
+        ),
+        bone_position_variance_ratio=_ratio(
+            take, position_mm, 1e3 * take.position_sigma_m[found, rows[frame]]
+        ),
         **_motion(truth, _in_place_of(match, position), true_position),
         found_share=len(found) / int(true_tracked.sum()) if true_tracked.any() else np.nan,
         extra_share=1 - len(found) / int(tracked.sum()) if tracked.any() else 0.0,
@@ -193,6 +203,15 @@ def _rotations(take: Take) -> Float[np.ndarray, "s t b 3 3"]:
     for subject in range(len(rotation)):
         rotation[subject] = take.bone_rotation_in_world(subject)
     return rotation
+
+
+def _ratio(
+    take: Take, errors: Float[np.ndarray, "n b"], sigma: Float[np.ndarray, "n b"]
+) -> dict[str, float]:
+    variance = np.square(sigma).sum(axis=0)
+    ratio = np.full(len(take.bone_names), np.nan)
+    np.divide(np.square(errors).sum(axis=0), variance, out=ratio, where=variance > 0)
+    return dict(zip(take.bone_names, ratio.tolist(), strict=True))
 
 
 def _per_bone(take: Take, errors: np.ndarray) -> dict[str, float]:

@@ -19,12 +19,12 @@ from fusecap.body.skeleton import Skeleton
 
 _TURN_SHARE = 0.17
 _TURN_SHARES = {
-    "spine": 0.035,
-    "spine1": 0.035,
-    "spine2": 0.035,
+    "spine": 0.06,
+    "spine1": 0.06,
+    "spine2": 0.06,
     "spine3": 0.06,
-    "neck": 0.1,
-    "head": 0.1,
+    "neck": 0.12,
+    "head": 0.12,
     "thigh": 0.09,
     "shank": 0.09,
     "foot": 0.09,

@@ -23,8 +23,7 @@ LONGEST_STEP_S = 0.1
 """Longer gaps are not bridged: the motion ends and begins anew."""
 EXACT_S = 1e-3
 """Within which an instant is as old as asked for: clocks round."""
-_DAMPING, _LEAST_DAMPING, _MAX_DAMPING = 1e-8, 1e-10, 1e6
-"""So little at first that the newest instant's matrix is its information."""
+_DAMPING, _LEAST_DAMPING, _MAX_DAMPING = 1e-4, 1e-8, 1e6
 _KEPT_PROMISE = 0.5
 """Of two steps that were needed, nearly all have a first one farther than this from its promise."""
 _UP_M_S2 = np.array([0.0, GRAVITY_M_S2, 0.0])
@@ -201,7 +200,10 @@ class WindowSolver:
         return theta
 
     def newest_spread(self) -> tuple[Float[np.ndarray, " b"], Float[np.ndarray, " b"]]:
-        """Traces [rad², m²] of what is known of the newest instant's bones and joints."""
+        """Traces [rad², m²] of what is known of the newest instant's bones and joints.
+
+        With the damping of the last step in it: less than `spreads` has.
+        """
         workspace, square = self._workspace, self._workspace.square[0]
         uncertainty.newest(self._newest, self._covariance, workspace.covariances, square)
         return self._spread(self.count - 1)

@@ -12,6 +12,7 @@ from itertools import pairwise
 import numpy as np
 from matplotlib.figure import Figure
 
+from fusecap.body.skeleton import PAPER21
 from fusecap.evaluate.cells import LATE_S, TwinCell
 from fusecap.evaluate.experiments.experiment import (
     Claim,
@@ -83,10 +84,37 @@ def report(settings: Settings, results: Results) -> Report:
         tables.append(
             Table(title=title, columns=("input", *COLUMNS, *truth), rows=tuple(rows), digits=digits)
         )
+    tables.append(_error_bars(settings, results))
     return Report(
         tables=tuple(tables),
         findings=tuple(_findings(settings, results)),
         plots={"": _plot(settings, results)},
+    )
+
+
+def _error_bars(settings: Settings, results: Results) -> Table:
+    """Squared errors over variances: what they come to per bone, over all sequences."""
+    rows: list[tuple[Value, ...]] = []
+    for cameras, imus in _inputs(settings):
+        cells = _row(settings, cameras, imus, alone=False)
+        values: list[Value] = []
+        for kind in ("newest", "score"):
+            for what in ("bone_orientation_variance_ratio", "bone_position_variance_ratio"):
+                bones = sorted(results.mean(cells, kind, what, bone) for bone in PAPER21.bone_names)
+                middle = bones[len(bones) // 2]
+                values.append(f"{middle:.2f} ({bones[0]:.2f}-{bones[-1]:.2f})")
+        rows.append((_named(cameras, imus), *values))
+    return Table(
+        title="Squared error over variance: the median bone (least - most)",
+        columns=(
+            "input",
+            "newest pose: rotation",
+            "newest pose: place",
+            "take: rotation",
+            "take: place",
+        ),
+        rows=tuple(rows),
+        note="1: the error bars are true; below they are too wide, above too narrow.",
     )
 
 
