@@ -304,6 +304,50 @@ def test_a_landing_from_a_height_is_not_smoothed_away(rng):
     assert np.abs(together[:, 1] - truth[:, 1]).max() < 0.02
 
 
+def test_a_somersault_is_followed(rng):
+    truth = walk(60, swing=0.0, speed_m_s=0.0)
+    t = np.arange(60) / RATE_HZ
+    air = np.clip((t - 0.2) / 0.6, 0.0, 1.0)
+    truth[:, 1] = 0.94 + 4.0 * 0.45 * air * (1.0 - air)
+    turned = Rotation.from_rotvec(np.outer(2 * np.pi * air, [1.0, 0.0, 0.0]))
+    truth[:, 3:6] = turned.as_rotvec()
+    together = moved_together(solver(), truth, observations(truth, noise_px=2.0, rng=rng))
+    errors = [pose_error_mm_deg(SHAPE, a, b) for a, b in zip(together, truth, strict=True)]
+    assert max(mm for mm, _ in errors) < 60.0
+    assert max(deg for _, deg in errors) < 30.0
+
+
+@pytest.mark.parametrize("fault", ["frozen", "slipped"])
+def test_one_sensor_that_lies_does_not_carry_the_motion_away(fault, rng):
+    truth = walk(90)
+    seen = observations(truth, noise_px=2.0, rng=rng)
+    worn = IMU13.index("left_shank")
+    for one in seen[30:]:
+        if fault == "frozen":
+            one.imu.bone_rotation_in_world[worn] = seen[30].imu.bone_rotation_in_world[worn]
+            one.imu.accel_in_world_m_s2[worn] = seen[30].imu.accel_in_world_m_s2[worn]
+        else:
+            slip = Rotation.from_rotvec([0.0, 0.6, 0.3]).as_matrix()
+            one.imu.bone_rotation_in_world[worn] = one.imu.bone_rotation_in_world[worn] @ slip
+    together = moved_together(solver(), truth, seen)
+    errors = [pose_error_mm_deg(SHAPE, a, b)[0] for a, b in zip(together, truth, strict=True)]
+    assert max(errors[:25]) < 40.0
+    assert np.mean(errors) < 40.0
+    assert np.isfinite(together).all()
+
+
+def test_half_a_minute_of_spinning_live():
+    truth = walk(1800, turn_hz=1.5)
+    pose_solver, seen = solver(2), observations(truth, cameras=2)
+    window = WindowSolver(pose_solver, 10)
+    worst_deg = 0.0
+    for one, pose in zip(seen, truth, strict=True):
+        window.push(one, pose)
+        window.refine(3)
+        worst_deg = max(worst_deg, pose_error_mm_deg(SHAPE, window.pose(), pose)[1])
+    assert worst_deg < 45.0
+
+
 def test_a_shock_of_sixteen_g_in_one_sensor_leaves_the_motion(rng):
     truth = walk(60)
     seen = observations(truth, noise_px=2.0, rng=rng)
