@@ -158,7 +158,7 @@ def _motion(settings: Settings, results: Results) -> Table:
             for w in WEIGHTS
         ),
         digits=2,
-        note="Frame by frame, without any smoothing afterwards.",
+        note="Alone and the paper's: each instant for itself, without any smoothing afterwards.",
     )
 
 
