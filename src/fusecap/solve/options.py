@@ -93,7 +93,7 @@ class SolverOptions:
     function_tolerance: float = 1e-4
     """Stop when a step lowers the cost, or promises to, by less than this share of it."""
     initial_damping: float = 1e-2
-    window: int = 10
+    window: int = 8
     """Instants that a live pose is solved together with, itself among them; 1: each alone."""
     floor_radius_m: float = 0.05
     """Distance kept between the floor and the ankle and toe joints [1, eq. 16]."""
