@@ -1,9 +1,9 @@
 """Motion instead of poses: the cost of one body over many instants, minimised together.
 
 The front of `fusecap.kernels.window`. Instants are coupled three by three, so the normal equations
-are solved in time linear in the number of instants. A window holds a few of
-them; those that leave are folded into what they say about the two oldest that stay, so that nothing
-measured is forgotten, nor held.
+are solved in time linear in the number of instants. A window holds a few of them; those that leave
+are folded into what they say about the two oldest that stay, so that nothing measured is forgotten,
+nor held.
 """
 
 from __future__ import annotations
