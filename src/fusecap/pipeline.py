@@ -120,8 +120,8 @@ class Pipeline:
     ) -> None:
         """People are sorted as the setup says, or by a `sorter` of one's own.
 
-        With a `pool` subjects are solved on its threads, to the same bits. A solve is so short that
-        this pays only where solves are made longer (docs/benchmarks.md, "How it grows").
+        With a `pool` subjects are solved on its threads, to the same bits; what that brings is in
+        docs/benchmarks.md, "How it grows".
         """
         self._setup = setup
         self._sorter = sorter or _own_sorter(setup)
