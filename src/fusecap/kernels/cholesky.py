@@ -65,31 +65,3 @@ def solve_factored(lower, right, solution_out):
         for j in range(i):
             total -= lower[i, j] * solution_out[j]
         solution_out[i] = total * lower[i, i]
-
-
-@kernel("void(f8[:, ::1], f8[:, ::1], f8[::1])")
-def inverse_diagonal(lower, inverse_scratch, diagonal_out):
-    """Diagonal of (Lᵀ L)⁻¹: the squared rows of L⁻¹, each from those above, four at a time."""
-    size = lower.shape[0]
-    for i in range(size):
-        for j in range(size):
-            inverse_scratch[i, j] = 0.0
-        fours = i // 4 * 4
-        for k in range(0, fours, 4):
-            s0, s1, s2, s3 = lower[i, k], lower[i, k + 1], lower[i, k + 2], lower[i, k + 3]
-            for j in range(k + 4):
-                inverse_scratch[i, j] -= (
-                    s0 * inverse_scratch[k, j]
-                    + s1 * inverse_scratch[k + 1, j]
-                    + s2 * inverse_scratch[k + 2, j]
-                    + s3 * inverse_scratch[k + 3, j]
-                )
-        for k in range(fours, i):
-            for j in range(k + 1):
-                inverse_scratch[i, j] -= lower[i, k] * inverse_scratch[k, j]
-        inverse_scratch[i, i] = 1.0
-        total = 0.0
-        for j in range(i + 1):
-            inverse_scratch[i, j] *= lower[i, i]
-            total += inverse_scratch[i, j] * inverse_scratch[i, j]
-        diagonal_out[i] = total
