@@ -15,10 +15,10 @@ BETWEEN = ("motion", "increment", "specific_force", "rest")
 class Weights:
     """λ of each term; 0 switches a term off.
 
-    The values are the paper's [1, sec. 3.2.6] with two exceptions; `paper()` has them all. The
-    acceleration term, which the paper finds not to help, is off: at its printed weight and 60 Hz
-    the frozen previous poses outweigh the keypoints. The orientation term is heavier, because at 1
-    the prior outweighs the sensors; how that was chosen is in docs/accuracy.md.
+    `paper()` has the paper's values [1, sec. 3.2.6]; how these were chosen is in
+    docs/cost_terms.md, "What measurements are worth". The paper's acceleration term, which it finds
+    not to help, is off: at its printed weight and 60 Hz the frozen previous poses outweigh the
+    keypoints.
     """
 
     position: float = 2e-3
@@ -30,7 +30,7 @@ class Weights:
     somebody is as large as in its studio (ρ = 220)."""
     orientation: float = 10.0
     """Per sin²(φ/2); the paper's value is 1. A sensor that is 6 deg off then costs what a pose one
-    standard deviation from the prior's mean does: λ φ²/4 = 0.06 at φ = 0.11 rad."""
+    standard deviation from the prior's mean does: λ φ²/4 = 0.03 at φ = 0.11 rad."""
     acceleration: float = 0.0
     """Per (m/s²)²; the paper's value is 1e-3."""
     projection: float = 2.8
