@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 
 from fusecap import Take, load_session, open_session, save_take, solve_session
 from fusecap.body.pose import landmarks_in_world
-from fusecap.export.plot import plot_take
+from fusecap.exports.plot import plot_take
 from fusecap.sources.session_data import SessionData
 
 RATE_HZ = 60.0

@@ -1,5 +1,6 @@
 import sys
 from dataclasses import replace
+from pathlib import Path
 from types import ModuleType
 
 import numpy as np
@@ -13,18 +14,28 @@ from bvh_reader import Bvh
 from fusecap.body.shape import end_offsets_m
 from fusecap.body.skeleton import EXTENDED23, PAPER21
 from fusecap.cli import app
-from fusecap.cli.common import write_take
+from fusecap.cli.common import Exports, write_take
 from fusecap.errors import InputError, TakeError
-from fusecap.export.formats import FORMATS
-from fusecap.export.formats.bvh import euler_zxy_rad, write_bvh
-from fusecap.export.take_files import TakeFormat, export_take
+from fusecap.exports.formats import FORMATS
+from fusecap.exports.formats.bvh import _ORDERS, euler_rad, write_bvh
+from fusecap.exports.rigs import PRESETS
+from fusecap.exports.take_files import export, export_take
+from fusecap.exports.take_format import ExportOptions, TakeFormat
 from fusecap.take import save_take
 from motions import any_poses, person, take_of, walk
+
+CONNECTING = {f"{side}_{bone}" for side in ("left", "right") for bone in ("pelvis", "clavicle")}
+
+
+def written(take, path, **options) -> Path:
+    """The first subject's file."""
+    write_bvh(take.of_subjects([0]), path, ExportOptions(**options))
+    return path
 
 
 def largest_error_m(path, take, subject=0, unit_m=1.0) -> float:
     read = Bvh(path).joint_positions()
-    assert set(read) == set(take.bone_names)
+    assert set(read) - CONNECTING == set(take.bone_names) - CONNECTING
     errors = [
         read[name] * unit_m - take.bone_position_in_world_m[subject, :, bone]
         for bone, name in enumerate(take.bone_names)
@@ -32,8 +43,8 @@ def largest_error_m(path, take, subject=0, unit_m=1.0) -> float:
     return float(np.abs(errors).max())
 
 
-def from_zxy(angles_rad) -> np.ndarray:
-    return Rotation.from_euler("ZXY", angles_rad).as_matrix()
+def turns(angles_rad, order) -> np.ndarray:
+    return Rotation.from_euler(order, angles_rad).as_matrix()
 
 
 @pytest.mark.parametrize("skeleton", [PAPER21, EXTENDED23], ids=lambda s: s.name)
@@ -50,7 +61,7 @@ def test_every_joint_of_every_frame_reads_back(tmp_path, rng, skeleton, unit, un
 def test_rest_pose_is_all_zero_rotations(tmp_path):
     theta = np.zeros((1, 2, 66))
     theta[:, :, 1] = 0.9
-    write_bvh(take_of(theta, [person()], names=("a",)), "a", tmp_path / "a.bvh")
+    written(take_of(theta, [person()], names=("a",)), tmp_path / "a.bvh")
     bvh = Bvh(tmp_path / "a.bvh")
     assert np.array_equal(bvh.motion[:, :3], [[0, 0.9, 0]] * 2)
     assert not bvh.motion[:, 3:].any()
@@ -61,37 +72,92 @@ def test_rest_pose_is_all_zero_rotations(tmp_path):
     assert all(c == ["Zrotation", "Xrotation", "Yrotation"] for c in bvh.channels[1:])
 
 
+def test_hips_and_shoulders_are_connected(tmp_path):
+    """As Blender draws it: a bone ends at the mean of its children."""
+    for skeleton in (PAPER21, EXTENDED23):
+        shape = person(skeleton=skeleton)
+        take = take_of(walk(shape, 1)[None], [shape], names=("a",))
+        bvh = Bvh(written(take, tmp_path / "a.bvh"))
+        offset = dict(zip(bvh.names, bvh.offsets, strict=True))
+        above = {n: bvh.names[p] for n, p in zip(bvh.names, bvh.parents, strict=True) if p >= 0}
+        for side in ("left", "right"):
+            assert above[f"{side}_thigh"] == f"{side}_pelvis"
+            assert above[f"{side}_upper_arm"] == f"{side}_clavicle"
+        tails = [offset[name] for name, parent in above.items() if parent == "hips"]
+        assert np.allclose(np.mean(tails, axis=0), [0, 0.09975, 0], atol=1e-6)
+
+
 def test_every_leaf_ends_where_the_body_does(tmp_path):
     shape = person(1.8)
-    write_bvh(take_of(walk(shape, 1)[None], [shape], names=("a",)), "a", tmp_path / "a.bvh")
+    written(take_of(walk(shape, 1)[None], [shape], names=("a",)), tmp_path / "a.bvh")
     ends = Bvh(tmp_path / "a.bvh").ends
     expected = end_offsets_m(shape)
     assert set(ends) == set(expected)
     assert all(np.allclose(ends[name], expected[name], atol=1e-6) for name in ends)
 
 
+orders = st.sampled_from(_ORDERS)
+
+
 @given(
+    orders,
     st.floats(-np.pi, np.pi),
     st.sampled_from([1.0, -1.0]),
     st.sampled_from([0.0, 1e-16, 1e-12, 1e-9, 1e-8, 1e-6, 1e-3, 0.1, 1.0]),
     st.floats(-np.pi, np.pi),
 )
-def test_euler_angles_give_the_rotation_also_near_gimbal_lock(a, sign, from_pole, c):
-    rotation = from_zxy([[a, sign * (np.pi / 2 - from_pole), c]])
-    assert np.abs(from_zxy(euler_zxy_rad(rotation)) - rotation).max() < 1e-14
+def test_euler_angles_give_the_rotation_also_near_gimbal_lock(order, a, sign, from_pole, c):
+    rotation = turns([[a, sign * (np.pi / 2 - from_pole), c]], order)
+    assert np.abs(turns(euler_rad(rotation, order), order) - rotation).max() < 1e-14
 
 
-@given(st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: np.dot(q, q) > 1e-3))
-def test_euler_angles_give_any_rotation(quaternion):
+@given(
+    orders,
+    st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: np.dot(q, q) > 1e-3),
+)
+def test_euler_angles_give_any_rotation(order, quaternion):
     rotation = Rotation.from_quat([quaternion]).as_matrix()
-    assert np.abs(from_zxy(euler_zxy_rad(rotation)) - rotation).max() < 1e-14
+    assert np.abs(turns(euler_rad(rotation, order), order) - rotation).max() < 1e-14
+
+
+def test_bends_of_90_degrees_do_not_jump(tmp_path):
+    """Knees, hips, elbows and shoulders of a noisy squat: no channel outruns its joint."""
+    frames = 200
+    rng = np.random.default_rng(3)
+    theta = walk(person(), frames)
+    bend = np.radians(90) * np.sin(np.linspace(0, np.pi, frames))
+    for name, axis, sign in (
+        *((f"{side}_shank", 0, 1) for side in ("left", "right")),
+        *((f"{side}_thigh", 0, -1) for side in ("left", "right")),
+        *(("left_forearm", 1, -1), ("right_forearm", 1, 1)),
+        *(("left_upper_arm", 1, -1), ("right_upper_arm", 2, 1)),
+    ):
+        theta[:, 3 + 3 * PAPER21.bone(name) + axis] = sign * bend
+    theta[:, 3:] += np.radians(0.3) * rng.standard_normal((frames, 63))
+    bvh = Bvh(written(take_of(theta[None], [person()], names=("a",)), tmp_path / "a.bvh"))
+    at = 0
+    for channels in bvh.channels:
+        angles = bvh.motion[:, at + len(channels) - 3 : at + len(channels)]
+        at += len(channels)
+        order = "".join(channel[0] for channel in channels[-3:])
+        turn = Rotation.from_euler(order, angles, degrees=True)
+        true_deg = np.degrees((turn[:-1].inv() * turn[1:]).magnitude())
+        assert (np.abs(np.diff(angles, axis=0)).max(axis=1) < 2.0 * true_deg + 0.2).all()
+
+
+@pytest.mark.parametrize("order", _ORDERS)
+def test_of_two_triples_the_nearer_one_follows(order):
+    """Through the pole and out again: an angle that passed 90 degrees goes on."""
+    angles = np.zeros((50, 3))
+    angles[:, 1] = np.linspace(0, 2.5, 50)
+    assert np.allclose(euler_rad(turns(angles, order), order), angles, atol=1e-9)
 
 
 def test_angles_do_not_jump_while_a_subject_spins(tmp_path):
     theta = np.zeros((1, 120, 66))
     theta[0, :, 4] = (np.linspace(0, 4 * np.pi, 120) + np.pi) % (2 * np.pi) - np.pi
     take = take_of(theta, [person()], names=("a",))
-    write_bvh(take, "a", tmp_path / "a.bvh")
+    written(take, tmp_path / "a.bvh")
     assert np.abs(np.diff(Bvh(tmp_path / "a.bvh").motion, axis=0)).max() < 10.0
     assert largest_error_m(tmp_path / "a.bvh", take) < 1e-5
 
@@ -109,7 +175,7 @@ def with_gap(take, gap):
 
 def test_untracked_frames_hold_the_last_pose(tmp_path):
     take = with_gap(take_of(walk(person(), 8)[None], [person()], names=("a",)), [0, 1, 4, 5])
-    write_bvh(take, "a", tmp_path / "a.bvh")
+    written(take, tmp_path / "a.bvh")
     motion = Bvh(tmp_path / "a.bvh").motion
     assert np.isfinite(motion).all() and len(motion) == 8
     assert np.array_equal(motion[[0, 1]], motion[[2, 2]])
@@ -122,7 +188,7 @@ def test_subject_never_tracked_is_refused_alone_and_skipped_among_others(tmp_pat
     take = take_of(np.stack([walk(person(), 3)] * 2), shapes, names=("a", "b"))
     take = with_gap(take, [0, 1, 2])
     with pytest.raises(TakeError, match="'a' is tracked in no frame"):
-        write_bvh(take, "a", tmp_path / "a.bvh")
+        written(take, tmp_path / "a.bvh")
     assert [p.name for p in export_take(take, tmp_path, format="bvh", stem="t")] == ["t_b.bvh"]
     assert [p.name for p in tmp_path.iterdir()] == ["t_b.bvh"]
 
@@ -156,19 +222,92 @@ def test_unknown_format_names_the_nearest_known_one(tmp_path):
 def test_the_format_asked_for_is_the_one_written(tmp_path, monkeypatch):
     """`--format` and `--export` go by the table, and a new entry of it is all they need."""
 
-    def write(take, subject, path, *, units_per_m=1.0):
-        path.write_text(f"{subject} {units_per_m:g}")
+    def write(take, path, options):
+        path.write_text(f"{take.subject_names} {options.unit}")
 
-    module = ModuleType("fusecap.export.formats.note")
-    module.FORMAT = TakeFormat(suffix=".note", write=write)
+    module = ModuleType("fusecap.exports.formats.note")
+    module.FORMAT = TakeFormat(suffix=".note", write=write, per_person=True, units=("m", "cm"))
     monkeypatch.setitem(sys.modules, module.__name__, module)
     monkeypatch.setitem(FORMATS, "note", "a note")
     take = take_of(walk(person(), 1)[None], [person()], names=("a",))
     save_take(take, tmp_path / "t.npz")
     command = ["export", str(tmp_path / "t.npz"), "--format", "note", "--unit", "cm"]
     assert CliRunner().invoke(app, command).exit_code == 0
-    assert (tmp_path / "t_a.note").read_text() == "a 100"
+    assert (tmp_path / "t_a.cm.note").read_text() == "('a',) cm"
     assert not list(tmp_path.glob("*.bvh"))
     again = tmp_path / "again.npz"
-    files = write_take(take, again, exports=["note", "bvh"], unit="m", picture=False)
+    files = write_take(take, again, Exports(formats=["note", "bvh"]), picture=False)
     assert [path.name for path in files] == ["again.npz", "again_a.note", "again_a.bvh"]
+
+
+def two_people(skeleton=PAPER21, names=("anna", "ben")):
+    shapes = [person(1.6, skeleton), person(1.9, skeleton)]
+    return take_of(np.stack([walk(shape, 6) for shape in shapes]), shapes, names=names)
+
+
+def test_metres_and_centimetres_and_rigs_never_share_a_name(tmp_path):
+    take = two_people(names=("anna", "anna_cm"))
+    paths = [
+        path
+        for unit in ("m", "cm")
+        for rig in PRESETS
+        for path in export_take(take, tmp_path, format="bvh", stem="t", unit=unit, rig=rig)
+    ]
+    assert len({*paths}) == len(paths) == 2 * 2 * len(PRESETS)
+    assert {"t_anna.bvh", "t_anna.cm.bvh", "t_anna_cm.bvh", "t_anna.mixamo.cm.bvh"} <= {
+        path.name for path in paths
+    }
+
+
+def test_exports_of_an_earlier_solve_are_renamed_and_kept(tmp_path):
+    target = tmp_path / "t.npz"
+    bvh = Exports(formats=["bvh"])
+    write_take(two_people(), target, bvh, picture=False)
+    ben = (tmp_path / "t_ben.bvh").read_bytes()
+    (tmp_path / "t_eva.bvh").write_text("somebody else's")
+    write_take(two_people(names=("anna", "carl")), target, bvh, picture=False)
+    assert (tmp_path / "t_ben.earlier1.bvh").read_bytes() == ben
+    write_take(two_people(), target, Exports(formats=[]), picture=False)
+    assert {path.name for path in tmp_path.iterdir()} == {
+        *("t.npz", "t_anna.earlier1.bvh", "t_ben.earlier1.bvh", "t_carl.earlier1.bvh"),
+        "t_eva.bvh",
+    }
+
+
+def test_export_goes_by_the_ending(tmp_path):
+    both = two_people()
+    paths = export(both, tmp_path / "x.bvh", unit="cm")
+    assert [path.name for path in paths] == ["x_anna.bvh", "x_ben.bvh"]
+    assert export(both.of_subjects([1]), tmp_path / "x.BVH") == [tmp_path / "x.BVH"]
+    with pytest.raises(InputError, match=r"no format ends with '.bvg'; did you mean '.bvh'"):
+        export(both, tmp_path / "x.bvg")
+    with pytest.raises(InputError, match="no rig 'mixamoo'; did you mean 'mixamo'"):
+        export(both, tmp_path / "x.bvh", rig="mixamoo")
+    with pytest.raises(InputError, match="written in m or cm, not in mm"):
+        export(both, tmp_path / "x.bvh", unit="mm")
+    with pytest.raises(TakeError, match="nothing to export"):
+        export(with_gap(both.of_subjects([0]), range(6)), tmp_path / "y.bvh")
+    assert not list(tmp_path.glob("y*"))
+
+
+@pytest.mark.parametrize("skeleton", [PAPER21, EXTENDED23], ids=lambda s: s.name)
+@pytest.mark.parametrize("rig", PRESETS)
+def test_every_rig_has_its_joints_where_the_take_has_them(tmp_path, rng, skeleton, rig):
+    """Three-spined rigs fold a joint, which costs millimetres in a format without places."""
+    shape = person(1.8, skeleton)
+    theta = walk(shape, 40)
+    theta[:, 3:] += 0.1 * rng.standard_normal((40, theta.shape[1] - 3))
+    take = take_of(theta[None], [shape], names=("a",))
+    (path,) = export_take(take, tmp_path, format="bvh", stem="t", rig=rig)
+    read = Bvh(path).joint_positions()
+    joints = PRESETS[rig].joints
+    assert list(read) != [] and {*read} == {joint.name for joint in joints}
+    folded = any(len(joint.turns_with) == 2 for joint in joints)
+    checked = 0
+    for joint in joints:
+        ours = joint.turns_with == (joint.sits_at,) and joint.towards is None
+        if ours and joint.sits_at in take.bone_names:
+            checked += 1
+            true = take.bone_position_in_world_m[0, :, take.skeleton.bone(joint.sits_at)]
+            assert np.abs(read[joint.name] - true).max() < (4e-3 if folded else 1e-5)
+    assert checked >= (18 if folded else 19)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from fusecap.body.skeleton import EXTENDED23, PAPER21
-from fusecap.export.take_files import export_take
+from fusecap.exports.take_files import export_take
 from motions import any_poses, person, take_of, walk
 
 SCRIPT = Path(__file__).parent / "blender" / "check_bvh.py"

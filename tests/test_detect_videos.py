@@ -20,7 +20,7 @@ from fusecap.cli import app
 from fusecap.detect.build import build_detector
 from fusecap.detect.detector import DetectorOptions
 from fusecap.errors import InputError, SessionError
-from fusecap.export.overlay import PeopleNumbers
+from fusecap.exports.overlay import PeopleNumbers
 from fusecap.setup import setup_of
 from fusecap.sources.detection_files import read_record
 from fusecap.sources.keypoint_files import read_keypoints

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import fusecap
-import fusecap.export.formats as exports
+import fusecap.exports.formats as exports
 import fusecap.motion.files as motions
 import fusecap.sources.calibration_files.formats as calibrations
 import fusecap.sources.imu_files.formats as imus

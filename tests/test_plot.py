@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fusecap.export.plot import plot_take
+from fusecap.exports.plot import plot_take
 from motions import person, take_of, walk
 
 

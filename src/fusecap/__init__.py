@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from fusecap.body.skeleton import PAPER21 as PAPER21
     from fusecap.body.skeleton import Skeleton as Skeleton
     from fusecap.errors import FusecapError as FusecapError
+    from fusecap.exports.take_files import export as export
     from fusecap.geometry.camera import Camera as Camera
     from fusecap.geometry.camera import Rig as Rig
     from fusecap.pipeline import Pipeline as Pipeline

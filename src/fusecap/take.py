@@ -12,7 +12,7 @@ import json
 import zipfile
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -140,6 +140,27 @@ class Take:
         if name not in self.subject_names:
             raise TakeError(f"the take has no subject '{name}'{nearest(name, self.subject_names)}")
         return self.subject_names.index(name)
+
+    def of_subjects(self, rows: Sequence[int]) -> Take:
+        """The same take with these subjects alone, in this order."""
+        kept = list(rows)
+        return replace(
+            self,
+            subject_names=tuple(self.subject_names[row] for row in kept),
+            **{
+                name: getattr(self, name)[kept]
+                for name in (
+                    "heights_m",
+                    "offsets_m",
+                    "theta",
+                    "bone_position_in_world_m",
+                    "bone_rotation_in_world_wxyz",
+                    "tracked",
+                    "bone_sigma_deg",
+                    "position_sigma_m",
+                )
+            },
+        )
 
     def shape(self, subject: int) -> BodyShape:
         """The body of one subject."""

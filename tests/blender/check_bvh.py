@@ -45,7 +45,7 @@ def main() -> None:
         position_m = expected[f"position_m_{index}"]
         names, heads, tails = imported(path, len(position_m))
         bones = expected[f"bones_{index}"].tolist()
-        assert sorted(names) == sorted(bones), (names, bones)
+        assert {*bones} <= {*names}, (names, bones)
         found_m = heads[:, [names.index(name) for name in bones]] @ Y_UP_FROM_BLENDER.T
         error_mm = 1e3 * np.linalg.norm(found_m - position_m, axis=-1)
         report = {

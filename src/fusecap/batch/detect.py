@@ -32,7 +32,7 @@ from jaxtyping import Bool, Float, Int
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.detect.detector import Detector, DetectorOptions
 from fusecap.errors import InputError, SessionError
-from fusecap.export import openpose
+from fusecap.exports import openpose
 from fusecap.files import plain, safe_name
 from fusecap.pipeline import Pipeline
 from fusecap.progress import Progress

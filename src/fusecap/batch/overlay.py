@@ -7,8 +7,8 @@ from pathlib import Path
 
 from fusecap.batch.detect import CameraVideo
 from fusecap.body.landmarks import LandmarkSet
-from fusecap.export.openpose import frame_path
-from fusecap.export.overlay import PeopleNumbers, draw_people, overlay_writer
+from fusecap.exports.openpose import frame_path
+from fusecap.exports.overlay import PeopleNumbers, draw_people, overlay_writer
 from fusecap.progress import Progress
 from fusecap.sources.keypoint_files import read_people
 

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from fusecap.body.skeleton import Skeleton
+from fusecap.body.skeleton import EXTENDED23, Skeleton
 from fusecap.errors import InputError, nearest
 
 REFERENCE_HEIGHT_M = 1.75
@@ -36,6 +36,7 @@ _NECK_HEIGHT = 0.835
 _HEAD_HEIGHT = 0.890
 _HALF_HIPS = 0.050
 _HALF_SHOULDERS = 0.0975
+_CLAVICLE = 0.015
 _UPPER_ARM = 0.186
 _FOREARM = 0.146
 _TOE_BASE_FORWARD = 0.080
@@ -60,8 +61,8 @@ def _reference_fractions(skeleton: Skeleton) -> dict[str, tuple[float, float, fl
     for side, sign in (("left", 1.0), ("right", -1.0)):
         rise = _SHOULDER_HEIGHT - spine3_height
         if f"{side}_clavicle" in skeleton.bone_names:
-            offsets[f"{side}_clavicle"] = (sign * 0.015, rise, 0.0)
-            offsets[f"{side}_upper_arm"] = (sign * (_HALF_SHOULDERS - 0.015), 0.0, 0.0)
+            offsets[f"{side}_clavicle"] = (sign * _CLAVICLE, rise, 0.0)
+            offsets[f"{side}_upper_arm"] = (sign * (_HALF_SHOULDERS - _CLAVICLE), 0.0, 0.0)
         else:
             offsets[f"{side}_upper_arm"] = (sign * _HALF_SHOULDERS, rise, 0.0)
         offsets[f"{side}_forearm"] = (sign * _UPPER_ARM, 0.0, 0.0)
@@ -141,3 +142,22 @@ def end_offsets_m(shape: BodyShape) -> dict[str, np.ndarray]:
         ends[f"{side}_hand"] = np.array([sign * 0.108, 0.0, 0.0]) * h
         ends[f"{side}_toes"] = np.array([0.0, 0.0, 0.045]) * h
     return ends
+
+
+def bones_of_extended(skeleton: Skeleton) -> list[int]:
+    """For each bone of `EXTENDED23` the one of `skeleton` that turns as it does."""
+    known = skeleton.bone_names
+    return [skeleton.bone(name if name in known else "spine3") for name in EXTENDED23.bone_names]
+
+
+def shape_with_clavicles(shape: BodyShape) -> BodyShape:
+    """The same body on `EXTENDED23`: no joint moves, the clavicles turn with the upper spine."""
+    skeleton = shape.skeleton
+    if "left_clavicle" in skeleton.bone_names:
+        return shape
+    offsets_m = shape.offsets_m[bones_of_extended(skeleton)]
+    for side in ("left", "right"):
+        clavicle, arm = EXTENDED23.bone(f"{side}_clavicle"), EXTENDED23.bone(f"{side}_upper_arm")
+        offsets_m[clavicle] = offsets_m[arm] * [_CLAVICLE / _HALF_SHOULDERS, 1, 1]
+        offsets_m[arm] -= offsets_m[clavicle]
+    return BodyShape(skeleton=EXTENDED23, offsets_m=offsets_m, height_m=shape.height_m)

@@ -4,21 +4,31 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from fusecap.cli.terminal import console, err, wrote
-from fusecap.errors import nearest
+from fusecap.cli.terminal import console, err, note, wrote
+from fusecap.errors import TakeError, nearest
+from fusecap.exports.formats import FORMATS
+from fusecap.exports.rigs import PRESETS
 from fusecap.files import plain
 
 if TYPE_CHECKING:
     from fusecap.batch.solve import Solved
+    from fusecap.exports.take_format import ExportOptions
     from fusecap.take import Take
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object for machines.")]
-Unit = Annotated[str, typer.Option(help="Length unit of exports: m (Blender) or cm (engines).")]
+Unit = Annotated[
+    str | None,
+    typer.Option(help="Length unit of exports that have a choice: m, cm (engines), mm."),
+]
+RigName = Annotated[
+    str, typer.Option("--rig", help="Names and rest pose of exported joints: " + ", ".join(PRESETS))
+]
 SessionPath = Annotated[
     Path, typer.Argument(help="session.toml, or the folder that holds it.", show_default=False)
 ]
@@ -51,19 +61,50 @@ def named(option: str, text: str, expected: str) -> tuple[str, str]:
     return name, value
 
 
-def write_take(
-    take: Take, path: Path, *, exports: list[str], unit: str, picture: bool
-) -> list[Path]:
-    from fusecap.export.take_files import export_take
-    from fusecap.take import save_take
+def format_names(option: str, text: str) -> list[str]:
+    """The names of a comma-separated list, each checked."""
+    names = list(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
+    for name in names:
+        check_choice(option, name, tuple(FORMATS))
+    return names
 
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Exports:
+    """What a command was asked to write beside a take."""
+
+    formats: list[str]
+    unit: str | None = None
+    rig: str = "native"
+    options: ExportOptions | None = None
+
+
+def write_take(take: Take, path: Path, exports: Exports, *, picture: bool) -> list[Path]:
+    """The take, its exports and its picture; exports of a take that stood there are set aside."""
+    from fusecap.exports.take_files import export_all, set_aside
+    from fusecap.take import load_take, save_take
+
+    try:
+        earlier = load_take(path).subject_names
+    except TakeError:
+        earlier = ()
     save_take(take, path)
     files = [path]
-    for format in exports:
-        files += export_take(take, path.parent, format=format, stem=path.stem, unit=unit)
+    if exports.formats:
+        files += export_all(
+            take,
+            path.parent,
+            formats=exports.formats,
+            stem=path.stem,
+            unit=exports.unit,
+            rig=exports.rig,
+            options=exports.options,
+        )
+    for aside in set_aside(path.stem, path.parent, earlier, files):
+        note(f"{aside.name} is of an earlier solve: renamed, and nothing of it was lost")
     frames = len(take.timestamps_ns)
     if picture and frames:
-        from fusecap.export.plot import plot_take
+        from fusecap.exports.plot import plot_take
 
         image = path.with_suffix(".png")
         plot_take(take, sorted({0, frames // 3, 2 * frames // 3, frames - 1}), image)

@@ -7,7 +7,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from fusecap.cli.common import Json, check_choice, finish, print_json, print_speed, write_take
+from fusecap.cli.common import (
+    Exports,
+    Json,
+    check_choice,
+    finish,
+    print_json,
+    print_speed,
+    write_take,
+)
 from fusecap.cli.terminal import console, progress, styled
 
 if TYPE_CHECKING:
@@ -57,7 +65,7 @@ def demo(
     with progress(quiet=as_json) as show:
         solved = solve_simulation(simulation, associate=associate, progress=show)
         live = live_takes(simulation, associate=associate, lag_s=LAG_S, progress=show)
-    files = write_take(solved.take, out / "demo.npz", exports=["bvh"], unit="m", picture=True)
+    files = write_take(solved.take, out / "demo.npz", Exports(formats=["bvh"]), picture=True)
     score = score_take(solved.take, simulation.truth)
     newest, settled = (score_take(take, simulation.truth) for take in live)
     result = {

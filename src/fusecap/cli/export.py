@@ -7,12 +7,15 @@ from typing import Annotated
 
 import typer
 
-from fusecap.cli.common import Json, Unit, check_choice, print_json
-from fusecap.cli.terminal import console
-from fusecap.export.formats import FORMATS
+from fusecap.cli.common import Json, RigName, Unit, check_choice, format_names, print_json
+from fusecap.cli.terminal import wrote
+from fusecap.exports.formats import FORMATS
+from fusecap.exports.rigs import PRESETS
 
-EXAMPLE = "Example: fusecap export take.npz --format bvh --unit cm --out bvh"
-_FORMATS_HELP = "; ".join(f"{name}: {what}" for name, what in FORMATS.items())
+EXAMPLE = "Example: fusecap export take.npz --format bvh,glb --rig mixamo --out files"
+_FORMATS_HELP = "One, or several with commas. " + "; ".join(
+    f"{name}: {what}" for name, what in FORMATS.items()
+)
 
 
 def export(
@@ -21,22 +24,43 @@ def export(
     ],
     format: Annotated[str, typer.Option(help=_FORMATS_HELP)] = "bvh",
     out: Annotated[Path | None, typer.Option(help="Folder; default: beside the take.")] = None,
-    unit: Unit = "m",
+    unit: Unit = None,
+    rig: RigName = "native",
+    session: Annotated[
+        Path | None,
+        typer.Option(help="Of openpose: the session whose cameras see the keypoints."),
+    ] = None,
     as_json: Json = False,
 ) -> None:
-    """Write a take in another format, one file per person.
+    """Write a take in other formats.
 
-    Of a recording: the poses as they were sent in the run; fusecap solve makes better ones.
+    A file's name says what is not usual: .cm, a rig. Of a recording: the poses as they were sent
+    in the run; fusecap solve makes better ones.
     """
     from fusecap.batch.replay import open_take
-    from fusecap.export.take_files import UNITS_PER_M, export_take
+    from fusecap.exports.take_files import export_all
+    from fusecap.exports.take_format import UNITS_PER_M, ExportOptions
+    from fusecap.sources.session_cameras import common_landmarks, open_rig
+    from fusecap.sources.session_file import load_session
 
-    check_choice("--format", format, tuple(FORMATS))
-    check_choice("--unit", unit, tuple(UNITS_PER_M))
-    files = export_take(
-        open_take(take), out or take.parent, format=format, stem=take.stem, unit=unit
+    formats = format_names("--format", format)
+    if unit is not None:
+        check_choice("--unit", unit, tuple(UNITS_PER_M))
+    check_choice("--rig", rig, tuple(PRESETS))
+    options = ExportOptions()
+    if session is not None:
+        loaded = load_session(session)
+        options = ExportOptions(cameras=open_rig(loaded)[0], landmarks=common_landmarks(loaded))
+    files = export_all(
+        open_take(take),
+        out or take.parent,
+        formats=formats,
+        stem=take.stem,
+        unit=unit,
+        rig=rig,
+        options=options,
     )
     if as_json:
-        print_json({"files": [str(path) for path in files], "unit": unit})
-    for path in files if not as_json else ():
-        console.print(f"wrote {path} ({unit})", soft_wrap=True)
+        print_json({"files": [str(path) for path in files]})
+    else:
+        wrote(*files)

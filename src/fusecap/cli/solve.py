@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from fusecap.cli.common import Json, Unit, check_choice, finish, print_json, print_speed, write_take
+from fusecap.cli.common import (
+    Exports,
+    Json,
+    RigName,
+    Unit,
+    check_choice,
+    finish,
+    format_names,
+    print_json,
+    print_speed,
+    write_take,
+)
 from fusecap.cli.terminal import console, note, progress, styled, table_of
 from fusecap.errors import InputError
-from fusecap.export.formats import FORMATS
+from fusecap.exports.formats import FORMATS
+from fusecap.exports.rigs import PRESETS
 
 if TYPE_CHECKING:
     from fusecap.batch.solve import Solved, SolveReport
@@ -38,7 +51,8 @@ def solve(
     export: Annotated[
         str | None, typer.Option(help=f"Other formats beside the take: {', '.join(FORMATS)}.")
     ] = None,
-    unit: Unit = "m",
+    unit: Unit = None,
+    rig: RigName = "native",
     picture: Annotated[bool, typer.Option("--picture", help="Also draw the motion.")] = False,
     as_live: Annotated[
         bool,
@@ -57,17 +71,16 @@ def solve(
     """
     from fusecap.batch.solve import solve_session
     from fusecap.cli.detect import detect_missing, print_detection
+    from fusecap.exports.take_format import ExportOptions
     from fusecap.files import safe_name
     from fusecap.recording.layout import SUFFIX
     from fusecap.sources.session_data import open_session
     from fusecap.sources.session_file import load_session
 
-    formats = _formats(export)
-    check_choice("--unit", unit, ("m", "cm"))
+    check_choice("--rig", rig, tuple(PRESETS))
+    exports = Exports(formats=format_names("--export", export or ""), unit=unit, rig=rig)
     if session.suffix == SUFFIX:
-        _solve_recording(
-            session, out, formats, unit, picture=picture, as_live=as_live, quiet=as_json
-        )
+        _solve_recording(session, out, exports, picture=picture, as_live=as_live, quiet=as_json)
         return
     if as_live:
         raise InputError(f"--as-live: {session} is no recording (.mcap) of a live run")
@@ -83,7 +96,8 @@ def solve(
         solved = solve_session(data, progress=show)
     if not solved.take.tracked.any() and not solved.report.interrupted:
         raise InputError(_nobody(solved.report))
-    files = write_take(solved.take, target, exports=formats, unit=unit, picture=picture)
+    seen = ExportOptions(cameras=data.rig, landmarks=data.landmarks)
+    files = write_take(solved.take, target, replace(exports, options=seen), picture=picture)
     detection = {} if detected is None else {"detection": detected.as_json()}
     _print_solved(solved, files, detection, as_json)
 
@@ -91,8 +105,7 @@ def solve(
 def _solve_recording(
     path: Path,
     out: Path | None,
-    formats: list[str],
-    unit: str,
+    exports: Exports,
     *,
     picture: bool,
     as_live: bool,
@@ -117,7 +130,7 @@ def _solve_recording(
             f"nobody could be followed in {solved.report.instants} instants of {path}; nothing "
             f"was written. What is in it: fusecap doctor {path}"
         )
-    files = write_take(solved.take, target, exports=formats, unit=unit, picture=picture)
+    files = write_take(solved.take, target, exports, picture=picture)
     _print_solved(solved, files, replay, quiet)
 
 
@@ -144,14 +157,6 @@ def _nobody(report: SolveReport) -> str:
         "for half a second or more, with calibration and clocks that agree: fusecap doctor "
         "checks both, fusecap detect --overlay draws whom it finds"
     )
-
-
-def _formats(text: str | None) -> list[str]:
-    """The names of a comma-separated list, each checked."""
-    formats = list(dict.fromkeys(p.strip() for p in (text or "").split(",") if p.strip()))
-    for name in formats:
-        check_choice("--export", name, tuple(FORMATS))
-    return formats
 
 
 def _print_report(solved: Solved) -> None:

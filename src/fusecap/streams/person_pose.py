@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from fusecap.body.shape import REFERENCE_HEIGHT_M, BodyShape
+from fusecap.body.shape import BodyShape, bones_of_extended, shape_with_clavicles
 from fusecap.body.skeleton import EXTENDED23, Skeleton
 from fusecap.geometry.quaternions import from_wxyz, to_xyzw
 from fusecap.take import Take
@@ -113,29 +113,21 @@ def pose_of_take(
 
 def with_clavicles(pose: PersonPose) -> PersonPose:
     """The same person on `extended23`; clavicles that were not solved have quality 0."""
-    skeleton = pose.skeleton
-    if "left_clavicle" in skeleton.bone_names:
+    if "left_clavicle" in pose.skeleton.bone_names:
         return pose
-    source = np.array(
-        [
-            skeleton.bone("spine3" if name.endswith("_clavicle") else name)
-            for name in EXTENDED23.bone_names
-        ]
-    )
+    source = bones_of_extended(pose.skeleton)
     position = pose.bone_position_in_world_m[source]
     rotation = pose.bone_rotation_in_world[source]
     quality = pose.bone_quality[source]
-    offsets_m = pose.shape.offsets_m[source]
+    extended = shape_with_clavicles(pose.shape)
     for side in ("left", "right"):
-        clavicle, arm = EXTENDED23.bone(f"{side}_clavicle"), EXTENDED23.bone(f"{side}_upper_arm")
-        offsets_m[clavicle] = offsets_m[arm] * [_CLAVICLE_SHARE, 1, 1]
-        offsets_m[arm] -= offsets_m[clavicle]
-        position[clavicle] += rotation[clavicle] @ offsets_m[clavicle]
+        clavicle = EXTENDED23.bone(f"{side}_clavicle")
+        position[clavicle] += rotation[clavicle] @ extended.offsets_m[clavicle]
         quality[clavicle] = 0.0
     return PersonPose(
         name=pose.name,
         timestamp_ns=pose.timestamp_ns,
-        shape=BodyShape(skeleton=EXTENDED23, offsets_m=offsets_m, height_m=pose.shape.height_m),
+        shape=extended,
         bone_position_in_world_m=position,
         bone_rotation_in_world=rotation,
         bone_quality=quality,
@@ -156,13 +148,3 @@ def in_parents(
     position[child] = np.einsum("nij,nj->ni", to_parent, away)
     rotation[child] = to_parent @ rotation_in_world[child]
     return position, rotation
-
-
-def _clavicle_share() -> float:
-    offsets_m = BodyShape.from_height(EXTENDED23, REFERENCE_HEIGHT_M).offsets_m
-    clavicle, arm = EXTENDED23.bone("left_clavicle"), EXTENDED23.bone("left_upper_arm")
-    return float(offsets_m[clavicle, 0] / (offsets_m[clavicle, 0] + offsets_m[arm, 0]))
-
-
-_CLAVICLE_SHARE = _clavicle_share()
-"""Of the shoulder's distance from the middle: where the clavicle begins (0.15)."""

@@ -14,7 +14,7 @@ from jaxtyping import Float, UInt8
 
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.engine.engine import LiveStep
-from fusecap.export.overlay import LINKS
+from fusecap.exports.overlay import LINKS
 from fusecap.geometry.camera import Camera, Rig
 from fusecap.types import CameraImage, CameraSample
 from fusecap.viewer.figure import Pose, pose_of

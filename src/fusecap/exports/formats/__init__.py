@@ -9,7 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from fusecap.export.take_files import TakeFormat
+    from fusecap.exports.take_format import TakeFormat
 
 FORMATS = {
     "bvh": "a skeleton and its rotations, for Blender, Unity, Unreal, MotionBuilder",

@@ -1,0 +1,140 @@
+"""A person's motion on a rig, as skeletal formats write it: joints relative to their parents."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
+
+from fusecap.body.shape import bones_of_extended, shape_with_clavicles
+from fusecap.body.skeleton import EXTENDED23
+from fusecap.errors import TakeError
+from fusecap.exports.rest_rig import RestRig, rest_rig
+from fusecap.exports.rigs import RigPreset
+from fusecap.geometry.quaternions import from_wxyz
+from fusecap.take import Take
+
+_MOVES_M = 1e-5
+"""A joint that wanders this far in its parent's frame has its place written for every frame."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RigMotion:
+    """Joints over T frames; a root's values are in the world."""
+
+    rest: RestRig
+    name: str
+    time_s: Float[np.ndarray, " t"]
+    rate_hz: float
+    position_m: Float[np.ndarray, "t j 3"]
+    """In the parent's frame."""
+    rotation_xyzw: Float[np.ndarray, "t j 4"]
+    """Relative to the parent, the rest pose included; from frame to frame the short way."""
+
+    @cached_property
+    def moving(self) -> tuple[int, ...]:
+        """Joints whose place in the parent's frame changes; the others keep that at rest."""
+        reach = np.abs(self.position_m - self.rest.position_in_parent_m).max(axis=(0, 2))
+        return tuple(np.flatnonzero(reach > _MOVES_M).tolist())
+
+    def rotation_from_rest(self) -> Float[np.ndarray, "t j 3 3"]:
+        """Relative to the parent, between frames that are parallel to the world at rest."""
+        rest = Rotation.from_matrix(self.rest.rotation)
+        turns = np.empty((*self.rotation_xyzw.shape[:2], 3, 3))
+        for joint, parent in enumerate(self.rest.parents):
+            turn = Rotation.from_quat(self.rotation_xyzw[:, joint]) * rest[joint].inv()
+            turns[:, joint] = (turn if parent < 0 else rest[parent] * turn).as_matrix()
+        return turns
+
+
+def held_frames(take: Take, subject: int) -> Int[np.ndarray, " t"]:
+    """For every frame the tracked frame whose pose it shows: the last one, at first the first.
+
+    Raises `TakeError` for a subject that is never tracked.
+    """
+    tracked = take.tracked[subject]
+    if not tracked.any():
+        raise TakeError(f"'{take.subject_names[subject]}' is tracked in no frame: nothing to write")
+    latest = np.maximum.accumulate(np.where(tracked, np.arange(len(tracked)), -1))
+    return np.where(latest < 0, np.argmax(tracked), latest)
+
+
+def rig_motion(take: Take, subject: int, preset: RigPreset) -> RigMotion:
+    """One subject of a take on a rig; frames without them hold the last pose."""
+    shape = shape_with_clavicles(take.shape(subject))
+    rest = rest_rig(preset, shape)
+    frames = held_frames(take, subject)
+    source = bones_of_extended(take.skeleton)
+    position = take.bone_position_in_world_m[subject][frames][:, source]
+    wxyz = take.bone_rotation_in_world_wxyz[subject][frames][:, source]
+    turns = [
+        from_wxyz(wxyz[:, bone]) * Rotation.from_matrix(rest.bone_rest[bone]).inv()
+        for bone in range(EXTENDED23.bone_count)
+    ]
+    """What each bone has turned since the rest pose."""
+    if "left_clavicle" not in take.bone_names:
+        for side in ("left", "right"):
+            bone = EXTENDED23.bone(f"{side}_clavicle")
+            position[:, bone] += from_wxyz(wxyz[:, bone]).apply(shape.offsets_m[bone])
+    return _on_joints(take, subject, rest, position, turns)
+
+
+def _on_joints(
+    take: Take,
+    subject: int,
+    rest: RestRig,
+    position: Float[np.ndarray, "t b 3"],
+    turns: list[Rotation],
+) -> RigMotion:
+    count, frames = len(rest.names), len(position)
+    bone_rest_m = _bone_rest_positions(rest)
+    place_m = np.empty((frames, count, 3))
+    world: list[Rotation] = []
+    for index, joint in enumerate(rest.preset.joints):
+        if not joint.turns_with:
+            place_m[:, index] = rest.position_m[index]
+            world.append(Rotation.identity(frames))
+            continue
+        bones = [EXTENDED23.bone(name) for name in joint.turns_with]
+        turn = turns[bones[0]]
+        place_m[:, index] = position[:, bones[0]] + turn.apply(
+            rest.position_m[index] - bone_rest_m[bones[0]]
+        )
+        if len(bones) == 2:
+            away = (turn.inv() * turns[bones[1]]).as_rotvec()
+            turn = turn * Rotation.from_rotvec(away / 2)
+        world.append(turn * Rotation.from_matrix(rest.rotation[index]))
+    position_m, xyzw = place_m.copy(), np.empty((frames, count, 4))
+    for index, parent in enumerate(rest.parents):
+        local = world[index]
+        if parent >= 0:
+            up = world[parent].inv()
+            position_m[:, index] = up.apply(place_m[:, index] - place_m[:, parent])
+            local = up * local
+        xyzw[:, index] = _short_way(local.as_quat())
+    return RigMotion(
+        rest=rest,
+        name=take.subject_names[subject],
+        time_s=take.time_s,
+        rate_hz=take.rate_hz,
+        position_m=position_m,
+        rotation_xyzw=xyzw,
+    )
+
+
+def _bone_rest_positions(rest: RestRig) -> Float[np.ndarray, "b 3"]:
+    place = np.zeros((EXTENDED23.bone_count, 3))
+    place[0, 1] = rest.shape.standing_root_height_m
+    for bone, parent in enumerate(EXTENDED23.parents[1:], start=1):
+        place[bone] = place[parent] + rest.bone_rest[parent] @ rest.shape.offsets_m[bone]
+    return place
+
+
+def _short_way(quaternion: Float[np.ndarray, "t 4"]) -> Float[np.ndarray, "t 4"]:
+    """The same rotations with signs such that neighbours are near."""
+    flips = np.einsum("ti,ti->t", quaternion[1:], quaternion[:-1]) < 0
+    signs = np.where(np.logical_xor.accumulate(np.concatenate([[False], flips])), -1.0, 1.0)
+    return quaternion * signs[:, None]

@@ -1,0 +1,52 @@
+"""What a module of `formats/` says of its format, and what it is told."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from fusecap.body.landmarks import LandmarkSet
+from fusecap.geometry.camera import Rig
+from fusecap.take import Take
+
+UNITS_PER_M = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
+METRE = ("m",)
+METRE_AND_CM = ("m", "cm")
+"""Blender wants metres, game engines centimetres."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExportOptions:
+    """What can be chosen; a format that has no use for a thing leaves it."""
+
+    unit: str = "m"
+    """One of the format's."""
+    rig: str = "native"
+    """One of `fusecap.exports.rigs.PRESETS`."""
+    cameras: Rig | None = None
+    """Those that keypoints are seen by."""
+    landmarks: LandmarkSet | None = None
+    """As the detector of those cameras names them."""
+
+
+class WriteTake(Protocol):
+    """Writes everybody in a take, whole or not at all; raises `InputError`."""
+
+    def __call__(self, take: Take, path: Path, options: ExportOptions, /) -> None: ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TakeFormat:
+    """What a format's module says of it."""
+
+    suffix: str
+    tag: str = ""
+    """Before the ending, where a file beside the take could else be the take itself."""
+    write: WriteTake
+    per_person: bool
+    """A file holds one person: each is a take with that one subject."""
+    units: tuple[str, ...] = METRE
+    """Of length, the usual one first."""
+    has_rig: bool = False
+    """Whether joints have names and a rest pose that a preset can choose."""
