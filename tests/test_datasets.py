@@ -208,7 +208,7 @@ def test_panoptic_joint_without_confidence_is_unknown(tmp_path):
     truth = panoptic.read_poses(tmp_path)
     assert np.isnan(truth.points_in_world_m[0, 2, 0]).all()
     path.write_text(path.read_text()[:100])
-    with pytest.raises(InputError, match=r"body3DScene_00000002.json: not a Panoptic pose file"):
+    with pytest.raises(InputError, match=r"body3DScene_00000002.json: not valid JSON"):
         panoptic.read_poses(tmp_path)
 
 
@@ -467,4 +467,4 @@ def test_session_with_truth_is_evaluated(tmp_path, monkeypatch, capsys):
     (tmp_path / "truth.npz").unlink()
     code, error = command(monkeypatch, capsys, "evaluate", "session", tmp_path)
     assert code == 1
-    assert "there is no take at" in error["error"]
+    assert "no such file; expected a take" in error["error"]

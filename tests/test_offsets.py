@@ -264,7 +264,7 @@ def test_garbled_file_says_what_is_wrong(tmp_path, change, message):
 
 
 def test_missing_file_is_named(tmp_path):
-    with pytest.raises(InputError, match=r"offsets\.toml: cannot be read"):
+    with pytest.raises(InputError, match=r"offsets\.toml: no such file"):
         read_offsets(tmp_path / "offsets.toml", "body25")
 
 

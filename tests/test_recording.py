@@ -426,9 +426,9 @@ def test_other_files_are_refused(tmp_path, content, says):
 
 
 def test_a_missing_file_and_a_folder_are_refused(tmp_path):
-    with pytest.raises(InputError, match="there is no recording"):
+    with pytest.raises(InputError, match="no such file; expected a recording"):
         Recording(tmp_path / "none.mcap")
-    with pytest.raises(InputError, match="cannot read"):
+    with pytest.raises(InputError, match="is a folder"):
         Recording(tmp_path)
 
 

@@ -578,4 +578,4 @@ def test_command_names_a_missing_take(tmp_path, monkeypatch, capsys):
     with pytest.raises(SystemExit) as ended:
         main()
     assert ended.value.code == 1
-    assert "there is no take at" in capsys.readouterr().err
+    assert "no such file; expected a take" in capsys.readouterr().err

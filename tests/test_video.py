@@ -114,7 +114,7 @@ def without_index(path):
         ("a.m4a", write_sound, "no video in this file, found audio"),
         ("a.mp4", lambda path: write_video(path, 0), "no video in this file, found nothing"),
         ("a.mkv", lambda path: write_video(path, 0), "cannot be read as a video"),
-        ("a.mp4", lambda path: path.mkdir(), "no such file"),
+        ("a.mp4", lambda path: path.mkdir(), "is a folder"),
         ("a.mp4", lambda path: None, "no such file"),
     ],
 )

@@ -483,4 +483,4 @@ def test_command_finds_the_board_in_images(tmp_path, monkeypatch, capsys):
         monkeypatch, capsys, old, "--board", tmp_path / "board.toml", *arguments, "--out", out
     )
     assert code == 1
-    assert "no image that can be read" in errors
+    assert "not a readable image" in errors

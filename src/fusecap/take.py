@@ -9,8 +9,6 @@ no forward kinematics. NaN stands only where `tracked` is false.
 from __future__ import annotations
 
 import json
-import zipfile
-import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import metadata
@@ -19,7 +17,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numpy.lib.npyio import NpzFile
 from scipy.spatial.transform import Rotation
 
 from fusecap.body.pose import forward_kinematics
@@ -28,10 +25,17 @@ from fusecap.body.skeleton import Skeleton
 from fusecap.errors import TakeError, nearest
 from fusecap.files import written_whole
 from fusecap.geometry.quaternions import from_wxyz, to_wxyz
+from fusecap.inputs import TAKE, read_npz
 from fusecap.types import Estimate, Status, quality_of
 
 FORMAT_VERSION = 2
 _FORMAT = f"fusecap take {FORMAT_VERSION}"
+_ENTRIES = (
+    *("format", "timestamps_ns", "rate_hz", "subject_names", "skeleton", "bone_names", "parents"),
+    *("heights_m", "offsets_m", "theta", "bone_position_in_world_m"),
+    *("bone_rotation_in_world_wxyz", "tracked", "bone_sigma_deg", "position_sigma_m"),
+    "provenance",
+)
 
 UNITS = {
     "timestamps_ns": "ns, one clock",
@@ -338,20 +342,7 @@ def save_take(take: Take, path: Path | str) -> None:
 def load_take(path: Path | str) -> Take:
     """Read a take; raises `TakeError` for a file that is missing, damaged or something else."""
     path = Path(path)
-    try:
-        with path.open("rb") as file:
-            archive = np.load(file, allow_pickle=False)
-            if not isinstance(archive, NpzFile):
-                raise ValueError("a single array")
-            arrays = {name: archive[name] for name in archive.files}
-    except FileNotFoundError:
-        raise TakeError(f"there is no take at {path}") from None
-    except OSError as error:
-        raise TakeError(f"cannot read {path}: {error.strerror or error}") from error
-    except (zipfile.BadZipFile, zlib.error, EOFError) as error:
-        raise TakeError(f"{path} is damaged or cut short ({error}); solve it again") from error
-    except ValueError as error:
-        raise TakeError(f"{path} is not a take: expected an .npz written by fusecap") from error
+    arrays = read_npz(path, TAKE, _ENTRIES)
     found = str(arrays.get("format", ""))
     if not found.startswith("fusecap take "):
         raise TakeError(f"{path} is not a take: it has no 'format' entry of fusecap")

@@ -11,12 +11,11 @@ With x the angle-axis vectors of every bone but the root, the solver adds two te
 from __future__ import annotations
 
 import json
-import zipfile
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import resources
-from importlib.resources.abc import Traversable
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +23,7 @@ from jaxtyping import Float
 
 from fusecap.body.skeleton import Skeleton, skeleton_named
 from fusecap.errors import InputError, MotionError
+from fusecap.inputs import PRIOR, read_npz
 
 _ARRAYS = ("mean", "basis", "sigma", "acceleration")
 _ORTHONORMAL_TOLERANCE = 1e-5
@@ -88,16 +88,16 @@ def load_prior(skeleton: Skeleton, path: Path | None = None) -> PosePrior:
     not fit the skeleton.
     """
     shipped = resources.files("fusecap.data") / f"prior_{skeleton.name}.npz"
-    source: Path | Traversable = shipped if path is None else path
-    if not source.is_file():
-        raise InputError(
-            f"no pose prior at {source}; train one with: fusecap calibrate prior MOTION_FOLDER"
-        )
+    with nullcontext(path) if path is not None else resources.as_file(shipped) as source:
+        if not source.exists():
+            raise InputError(
+                f"no pose prior at {source}; train one with: fusecap calibrate prior MOTION_FOLDER"
+            )
+        stored = read_npz(source, PRIOR, ("recipe", *_ARRAYS))
     try:
-        with source.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-            recipe = json.loads(str(stored["recipe"]))
-            arrays = {name: stored[name].astype(np.float64) for name in _ARRAYS}
-    except (KeyError, ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
+        recipe = json.loads(str(stored["recipe"]))
+        arrays = {name: stored[name].astype(np.float64) for name in _ARRAYS}
+    except (KeyError, ValueError, RecursionError) as error:
         raise InputError(f"{source} is not a pose prior: {error}") from None
     if not isinstance(recipe, dict) or recipe.get("skeleton") != skeleton.name:
         found = recipe.get("skeleton") if isinstance(recipe, dict) else None

@@ -102,12 +102,12 @@ def _origin(found: Synchronisation) -> str:
 def _name(path: Path) -> bool:
     """Adds `sync = "sync.toml"` below [session] unless a sync is named; whether it did."""
     import re
-    import tomllib
 
     from fusecap.files import write_whole
+    from fusecap.inputs import SESSION, read_text, read_toml
 
-    text = path.read_text(encoding="utf-8")
-    if "sync" in tomllib.loads(text).get("session", {}):
+    text = read_text(path, SESSION)
+    if "sync" in read_toml(path, SESSION).get("session", {}):
         return False
     changed = re.sub(
         r"^(\s*\[\s*session\s*\][^\n]*)$", r'\1\nsync = "sync.toml"', text, count=1, flags=re.M

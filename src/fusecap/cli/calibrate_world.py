@@ -233,9 +233,8 @@ def _known_length(rig: Rig, scale_by: str | None, marked: MarkedPoints | None) -
 
 def _views(rig: Rig, board_file: Path, floor: list[Path]) -> tuple[dict[str, BoardView], Board]:
     """The board in each camera's image; raises `CalibrationError` for an image without it."""
-    import cv2
-
     from fusecap.calibrate.cameras.board import read_board, why_not_found
+    from fusecap.calibrate.cameras.board_views import read_grey
     from fusecap.errors import CalibrationError
 
     board = read_board(board_file)
@@ -243,9 +242,7 @@ def _views(rig: Rig, board_file: Path, floor: list[Path]) -> tuple[dict[str, Boa
     for text in floor:
         name, path = named("--floor", str(text), "CAMERA=IMAGE")
         camera = rig[name]
-        image = cv2.imread(path, cv2.IMREAD_GRAYSCALE) if Path(path).is_file() else None
-        if image is None:
-            raise CalibrationError(f"{path}: no image that can be read; expected a PNG or JPEG")
+        image = read_grey(path)
         if (image.shape[1], image.shape[0]) != camera.size_px:
             raise CalibrationError(
                 f"{path} is {image.shape[1]} x {image.shape[0]} px, camera '{name}' was calibrated "

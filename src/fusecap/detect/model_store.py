@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from fusecap.errors import InputError, nearest
+from fusecap.inputs import NETWORK, SETTINGS, open_input, read_text
 from fusecap.progress import Progress
 
 TIMEOUT_S = 10.0
@@ -168,7 +169,7 @@ def _expected(stored: StoredModel, record: Path, found: str) -> str:
         return stored.sha256
     if not record.is_file():
         _write_record(record, found)
-    return record.read_text(encoding="ascii", errors="replace").strip()
+    return read_text(record, SETTINGS, strict=False).strip()
 
 
 def _fetch(
@@ -278,7 +279,7 @@ def _by_hand(stored: StoredModel, path: Path) -> str:
 
 
 def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
+    with open_input(path, NETWORK) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 

@@ -32,6 +32,7 @@ from typing import Any
 from fusecap.errors import InputError
 from fusecap.evaluate.code_version import versions_of
 from fusecap.files import written_whole
+from fusecap.inputs import CELL, read_json
 
 Work = Callable[[Any], dict[str, Any]]
 OnOutcome = Callable[["Outcome", int, int], None]
@@ -119,11 +120,11 @@ def cell_key(cell: Any, work: Work, versions: Mapping[str, str]) -> str:
 def _read(path: Path) -> dict[str, Any] | None:
     """Result and time of a finished cell; None where there is none, or not a whole one."""
     try:
-        stored = json.loads(path.read_text(encoding="utf-8"))
+        stored = read_json(path, CELL)
         if stored["format"] != _FORMAT or not isinstance(stored["result"], dict):
             return None
         return {"result": stored["result"], "elapsed_s": float(stored["elapsed_s"])}
-    except (OSError, ValueError, KeyError, TypeError):
+    except (InputError, ValueError, KeyError, TypeError):
         return None
 
 

@@ -13,6 +13,7 @@ from fusecap.body.shape import REFERENCE_HEIGHT_M, BodyShape
 from fusecap.body.skeleton import PAPER21
 from fusecap.errors import InputError
 from fusecap.evaluate.simulator import at_times, placed
+from fusecap.inputs import MOTION, read_text
 from fusecap.motion.files import motion_formats
 from fusecap.motion.retarget import retarget
 from fusecap.take import load_take
@@ -79,10 +80,7 @@ def load_motion(path: Path) -> list[MotionClip]:
 
 
 def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8", errors="replace")
-    except OSError as error:
-        raise InputError(f"cannot read motion {path}: {error.strerror}") from error
+    return read_text(path, MOTION, strict=False)
 
 
 def _of_take(path: Path) -> list[MotionClip]:

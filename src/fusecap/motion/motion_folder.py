@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 
 from fusecap.errors import InputError, nearest
+from fusecap.inputs import ARCHIVE, MOTION, open_input, read_bytes
 from fusecap.motion.files import motion_formats
 from fusecap.motion.motion import Motion
 from fusecap.motion.motion_format import MotionFormat
@@ -72,14 +73,15 @@ def _texts(folder: Path, formats: Mapping[str, MotionFormat]) -> Mapping[str, st
     wanted = {*formats, *(format.beside for format in formats.values() if format.beside)}
     for file in sorted(folder.rglob("*")):
         if file.suffix in wanted and file.is_file():
-            add(file.relative_to(folder).as_posix(), file.read_bytes())
+            add(file.relative_to(folder).as_posix(), read_bytes(file, MOTION))
     for archive in sorted(path for pattern in _ARCHIVES for path in folder.glob(pattern)):
         try:
-            with tarfile.open(archive) as tar:
+            with open_input(archive, ARCHIVE) as file, tarfile.open(fileobj=file) as tar:
                 for member in tar:
-                    content = tar.extractfile(member) if member.isfile() else None
-                    if content is not None and PurePosixPath(member.name).suffix in wanted:
-                        add(PurePosixPath(member.name).as_posix(), content.read())
+                    path = PurePosixPath(member.name)
+                    content = tar.extractfile(member) if path.suffix in wanted else None
+                    if content is not None and member.size <= (MOTION.most_bytes or 0):
+                        add(path.as_posix(), content.read())
         except (tarfile.TarError, EOFError, OSError) as error:
             raise InputError(f"{archive}: cannot be unpacked: {error}") from None
     return texts

@@ -14,7 +14,7 @@ import struct
 import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from io import BytesIO
+from io import BufferedReader, BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -27,6 +27,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Message, Metadata, Schema
 
 from fusecap.errors import InputError, MotionError
+from fusecap.inputs import RECORDING, open_input
 from fusecap.progress import Progress
 from fusecap.recording.layout import DECODERS, END, FORMAT, HEADER, Known, RecordedBody
 from fusecap.types import Event
@@ -158,7 +159,7 @@ class Recording:
 
     def sha256(self) -> str:
         """Of the file."""
-        with self.path.open("rb") as file:
+        with self._opened() as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
 
     def _item(self, schema: str, message: Message, numbers: _Numbers) -> Item | None:
@@ -200,13 +201,8 @@ class Recording:
             "off before it"
         )
 
-    def _opened(self) -> BinaryIO:
-        try:
-            return self.path.open("rb")
-        except FileNotFoundError:
-            raise InputError(f"there is no recording at {self.path}") from None
-        except OSError as error:
-            raise InputError(f"cannot read {self.path}: {error.strerror or error}") from None
+    def _opened(self) -> BufferedReader:
+        return open_input(self.path, RECORDING)
 
     def _records(
         self, file: BinaryIO, loss: Loss, progress: Progress | None

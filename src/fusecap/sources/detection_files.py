@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from fusecap.errors import InputError
+from fusecap.inputs import DETECTION, VIDEO, open_input, read_json
 from fusecap.progress import Progress
 from fusecap.sources.video import Video
 
@@ -95,7 +96,7 @@ def mark(video: Video, progress: Progress | None = None) -> VideoMark:
     digest = hashlib.sha256()
     size = video.path.stat().st_size
     done = 0
-    with video.path.open("rb") as file:
+    with open_input(video.path, VIDEO) as file:
         while chunk := file.read(_CHUNK_BYTES):
             digest.update(chunk)
             done += len(chunk)
@@ -114,11 +115,12 @@ def mark(video: Video, progress: Progress | None = None) -> VideoMark:
 def read_record(folder: Path) -> DetectionRecord | None:
     """The record of a folder, None where it has none; raises `InputError` for a broken one."""
     path = folder / FILE_NAME
-    if not path.is_file():
+    if not path.exists():
         return None
+    data = read_json(path, DETECTION)
     try:
-        return _record(json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
+        return _record(data)
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise InputError(
             f"{path}: cannot be read ({type(error).__name__}: {error}); expected the record of a "
             "detection: delete the folder and detect again"

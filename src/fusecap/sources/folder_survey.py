@@ -11,6 +11,7 @@ from pathlib import Path
 
 from fusecap.body.landmarks import LANDMARK_SETS, LandmarkSet
 from fusecap.errors import FusecapError, InputError
+from fusecap.inputs import KEYPOINTS, read_bytes
 from fusecap.sources.calibration_files.loader import load_rig, may_be_calibration
 from fusecap.sources.imu_files import imu_format_of, sensor_names
 from fusecap.sources.sensor_bones import bone_of
@@ -113,9 +114,9 @@ def _keypoint_format(folder: Path, keypoints: dict[str, Path]) -> str | None:
 def _holds(file: Path, landmarks: LandmarkSet) -> bool:
     """Whether the file's first person has as many keypoints as the set."""
     try:
-        people = json.loads(file.read_bytes())["people"]
+        people = json.loads(read_bytes(file, KEYPOINTS))["people"]
         return len(people[0]["pose_keypoints_2d"]) == 3 * len(landmarks.landmark_names)
-    except (OSError, ValueError, KeyError, IndexError, TypeError, RecursionError):
+    except (InputError, ValueError, KeyError, IndexError, TypeError, RecursionError):
         return False
 
 

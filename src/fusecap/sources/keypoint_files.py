@@ -20,13 +20,12 @@ import numpy as np
 
 from fusecap.body.landmarks import LANDMARK_SETS, LandmarkSet
 from fusecap.errors import InputError
+from fusecap.inputs import KEYPOINTS, read_bytes
 from fusecap.progress import Progress
 from fusecap.sources.detection_files import read_record
 
 MAX_FRAME = 10**9
 """Longer numbers are dates or serials."""
-MAX_FILE_BYTES = 4_000_000
-"""Of one frame; a thousand people with hands and faces are less."""
 
 _FRAME_NUMBER = re.compile(r"(\d+)(?:_keypoints)?$")
 
@@ -152,12 +151,9 @@ def read_people(path: Path, landmarks: LandmarkSet) -> np.ndarray | None:
 def _read_frame(path: str, landmarks: LandmarkSet) -> np.ndarray:
     count = len(landmarks.landmark_names)
     try:
-        with open(path, "rb") as file:
-            if os.fstat(file.fileno()).st_size > MAX_FILE_BYTES:
-                raise _BrokenFile
-            entries = json.load(file)["people"]
+        entries = json.loads(read_bytes(path, KEYPOINTS))["people"]
         flat = [entry["pose_keypoints_2d"] for entry in entries]
-    except (ValueError, KeyError, TypeError, OSError, RecursionError):
+    except (ValueError, KeyError, TypeError, InputError, RecursionError):
         raise _BrokenFile from None
     flat = [values for values in flat if values]
     for values in flat:

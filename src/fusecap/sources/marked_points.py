@@ -12,6 +12,7 @@ points that merely lie on the floor leaves them out. Pixel (0, 0) is the centre 
 from __future__ import annotations
 
 import csv
+import io
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fusecap.errors import InputError, nearest
+from fusecap.inputs import POINTS, read_text
 
 _WORLD = ("x_m", "y_m", "z_m")
 
@@ -37,12 +39,10 @@ class MarkedPoints:
 def read_marked_points(path: Path | str, cameras: tuple[str, ...]) -> MarkedPoints:
     """The points of a file, for cameras of these names; raises `InputError` with the line."""
     path = Path(path)
+    lines = io.StringIO(read_text(path, POINTS), newline="")
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = [row for row in csv.reader(file) if any(cell.strip() for cell in row)]
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
-    except (UnicodeDecodeError, csv.Error) as error:
+        rows = [row for row in csv.reader(lines) if any(cell.strip() for cell in row)]
+    except csv.Error as error:
         raise InputError(f"{path}: not a CSV file: {error}") from None
     header = [cell.strip() for cell in rows[0]] if rows else []
     if not header or header[0] != "name":

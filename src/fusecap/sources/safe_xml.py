@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from xml.etree import ElementTree
 
+from fusecap.inputs import InputKind, read_bytes
+
 
 class XmlError(ValueError):
     """Broken XML, or XML that declares a document type."""
@@ -16,11 +18,12 @@ class _Builder(ElementTree.TreeBuilder):
         raise XmlError("declares a document type (<!DOCTYPE>), which is not read; remove it")
 
 
-def parse(path: Path) -> ElementTree.Element:
-    """The root element; raises `XmlError` with the line of the damage."""
+def parse(path: Path, kind: InputKind) -> ElementTree.Element:
+    """The root element; raises `XmlError` with the line of the damage, or `kind.error`."""
     parser = ElementTree.XMLParser(target=_Builder())
+    content = read_bytes(path, kind)
     try:
-        parser.feed(path.read_bytes())
+        parser.feed(content)
         return parser.close()
     except ElementTree.ParseError as error:
         raise XmlError(f"broken or truncated XML: {error}") from None

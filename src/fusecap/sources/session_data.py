@@ -19,6 +19,7 @@ from fusecap.body.landmarks import LandmarkSet
 from fusecap.errors import FusecapError, SessionError
 from fusecap.findings import Finding
 from fusecap.geometry.camera import Rig
+from fusecap.inputs import SENSORS, SESSION, read_bytes
 from fusecap.progress import Progress
 from fusecap.sources.detection_files import read_record
 from fusecap.sources.imu_files import ImuTrack
@@ -292,7 +293,7 @@ def content_hash(session: Session) -> str:
     Of keypoint folders names and sizes only, and of detected ones the video and the detector. The
     same inputs hash alike in every folder.
     """
-    digest = hashlib.sha256(session.path.read_bytes() if session.path.is_file() else b"")
+    digest = hashlib.sha256(read_bytes(session.path, SESSION) if session.path.is_file() else b"")
     inputs = [session.settings.calibration, session.settings.landmark_offsets]
     inputs += [session.settings.imu_calibration]
     inputs += [session.settings.sync] if session.settings.sync is not None else []
@@ -319,4 +320,4 @@ def _add_file(digest: hashlib._Hash, path: Path, *, with_content: bool) -> None:
     size = path.stat().st_size
     digest.update(f"{path.name}\0{size}\0".encode())
     if with_content and size <= HASHED_BYTES:
-        digest.update(path.read_bytes())
+        digest.update(read_bytes(path, SENSORS))

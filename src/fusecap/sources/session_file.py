@@ -5,7 +5,6 @@ It opens none of the named files but the sensors' calibration.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from fusecap.errors import SessionError
+from fusecap.inputs import SESSION, read_toml
 from fusecap.sources.imu_calibration_files import read_imu_calibration
 from fusecap.sources.session import FILE_NAME, Session
 
@@ -62,12 +62,7 @@ def with_imu_calibration(session: Session) -> Session:
 def parse_session(path: Path | str) -> Session:
     """`load_session` without looking whether the files it names exist."""
     file = session_file(path)
-    try:
-        data = tomllib.loads(file.read_text(encoding="utf-8"))
-    except tomllib.TOMLDecodeError as error:
-        raise SessionError(f"{file}: not valid TOML: {error}") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise SessionError(f"{file}: cannot be read as UTF-8 text: {error}") from None
+    data = read_toml(file, SESSION)
     try:
         return Session.model_validate(data, context={"file": file})
     except ValidationError as error:
@@ -78,7 +73,7 @@ def session_file(path: Path | str) -> Path:
     """The session file that `path` (a file or its folder) means; raises `SessionError`."""
     path = Path(path)
     file = path / FILE_NAME if path.is_dir() else path
-    if not file.is_file():
+    if not file.exists():
         raise SessionError(
             f"{file}: no such file; expected a session file or a folder with a {FILE_NAME}"
         )

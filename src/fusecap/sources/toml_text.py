@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from pathlib import Path
 from typing import Any
 
 from fusecap.errors import InputError
+from fusecap.inputs import SETTINGS, read_toml
 
 
 def quoted(text: str) -> str:
@@ -17,12 +17,7 @@ def quoted(text: str) -> str:
 
 def read_written(path: Path, format: str, command: str) -> dict[str, Any]:
     """The keys of a file of this `format`, which `command` writes; raises `InputError`."""
-    try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from None
+    data = read_toml(path, SETTINGS)
     if data.get("format") != format:
         raise InputError(
             f'{path}: format is {data.get("format")!r}, expected "{format}"; write the file with: '

@@ -28,6 +28,7 @@ from av.video.reformatter import VideoReformatter
 from av.video.stream import VideoStream
 
 from fusecap.errors import InputError
+from fusecap.inputs import VIDEO, check_input
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mts", ".mpg", ".mpeg")
 """What counts as a video in a folder."""
@@ -216,8 +217,7 @@ def videos_in(folder: Path) -> list[Path]:
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
     """The file and its first video stream that is not a cover picture."""
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; expected a video")
+    check_input(path, VIDEO)
     if path.stat().st_size == 0:
         raise InputError(f"{path}: an empty file, expected a video; record or copy it again")
     try:

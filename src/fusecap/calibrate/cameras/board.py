@@ -20,7 +20,6 @@ its views then name their corners from either end (`Board.ambiguous`).
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -32,6 +31,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from fusecap.errors import CalibrationError, nearest
+from fusecap.inputs import BOARD, read_toml
 
 CHARUCO, CHECKERBOARD = "charuco", "checkerboard"
 KINDS = (CHARUCO, CHECKERBOARD)
@@ -250,15 +250,7 @@ class Board:
 def read_board(path: Path | str) -> Board:
     """The board of a `board.toml`; raises `CalibrationError` that names the key and the remedy."""
     path = Path(path)
-    try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise CalibrationError(
-            f"{path}: cannot be read: {error.strerror}; expected a board file with "
-            "kind, columns, rows and square_m"
-        ) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise CalibrationError(f"{path}: not valid TOML: {error}") from None
+    data = read_toml(path, BOARD)
     for key in data:
         if key not in _KEYS:
             raise CalibrationError(f"{path}: unknown key '{key}'{nearest(key, _KEYS)}")

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import csv
 import glob
+import io
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -25,6 +26,7 @@ from fusecap.calibrate.cameras.board import (
     why_not_found,
 )
 from fusecap.errors import CalibrationError, nearest
+from fusecap.inputs import PICTURE, POINTS, read_bytes, read_text
 from fusecap.progress import Progress
 from fusecap.sources.video import VIDEO_SUFFIXES, Video
 
@@ -140,9 +142,8 @@ def read_timestamps(path: Path | str) -> dict[str, list[int]]:
     """Per `cam_id` the `sync_index` of each of its frames, in order."""
     path = Path(path)
     try:
-        with path.open(encoding="utf-8", newline="") as file:
-            rows = list(csv.DictReader(file))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        rows = list(csv.DictReader(io.StringIO(read_text(path, POINTS), newline="")))
+    except csv.Error as error:
         raise CalibrationError(f"{path}: cannot be read: {error}") from None
     result: dict[str, list[tuple[float, int]]] = {}
     for line, row in enumerate(rows, start=2):
@@ -258,15 +259,25 @@ def _files(source: str, path: Path) -> list[Path]:
     return files
 
 
+def read_grey(file: Path | str) -> np.ndarray:
+    """(h, w) uint8, the picture in a file; raises `InputError`."""
+    try:
+        content = np.frombuffer(read_bytes(file, PICTURE), np.uint8)
+        grey = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE)
+    except cv2.error:  # nothing to decode, or more pixels than OpenCV reads
+        grey = None
+    if grey is None:
+        raise CalibrationError(f"{file}: not a readable image; copy it again or remove it")
+    return grey
+
+
 def _stills(files: Sequence[Path]) -> Iterator[_Image]:
     numbers = [re.findall(r"\d+", file.stem) for file in files]
     instants = [int(n[-1]) if n else -1 for n in numbers]
     if len(set(instants)) < len(files) or -1 in instants:
         instants = list(range(len(files)))
     for file, instant in zip(files, instants, strict=True):
-        grey = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-        if grey is None:
-            raise CalibrationError(f"{file}: not a readable image; copy it again or remove it")
+        grey = read_grey(file)
         yield _Image(instant=instant, label=file.name, grey=grey)
 
 

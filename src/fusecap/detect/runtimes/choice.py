@@ -7,6 +7,7 @@ from pathlib import Path
 from fusecap.detect.runtimes import onnxruntime, openvino
 from fusecap.detect.runtimes.network import Network
 from fusecap.errors import InputError, nearest
+from fusecap.inputs import NETWORK, check_input
 
 RUNTIMES = ("auto", "onnxruntime", "openvino")
 
@@ -17,8 +18,7 @@ def open_network(path: Path, runtime: str = "auto", threads: int | None = None) 
     "auto" takes .xml to OpenVINO and .onnx to ONNX Runtime, or to OpenVINO where that alone is
     installed. Raises `InputError` for a missing or broken file and where the runtime is missing.
     """
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; expected a network (.onnx or OpenVINO .xml)")
+    check_input(path, NETWORK)
     if runtime_for(path, runtime) == "onnxruntime":
         return onnxruntime.OnnxNetwork(path, threads)
     return openvino.OpenVinoNetwork(path, threads)

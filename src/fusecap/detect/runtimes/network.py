@@ -10,6 +10,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float32
 
+from fusecap.inputs import NETWORK, read_bytes
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tensor:
@@ -52,10 +54,10 @@ class Network(Protocol):
 
 def file_identity(path: Path, runtime: str) -> str:
     """File name, 16 digits of the SHA-256 of its content (weights beside it included), runtime."""
-    digest = hashlib.sha256(path.read_bytes())
+    digest = hashlib.sha256(read_bytes(path, NETWORK))
     weights = path.with_suffix(".bin")
     if path.suffix == ".xml" and weights.is_file():
-        digest.update(weights.read_bytes())
+        digest.update(read_bytes(weights, NETWORK))
     return f"{path.name} sha256:{digest.hexdigest()[:16]} {runtime}"
 
 

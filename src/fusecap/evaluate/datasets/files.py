@@ -6,13 +6,18 @@ import tarfile
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from fusecap.errors import InputError
 from fusecap.geometry.camera import Camera
+from fusecap.inputs import ARCHIVE, DATASET, open_input, read_text
 from fusecap.sources.calibration_files import fields
+
+MOST_UNPACKED_BYTES = 32 << 30
+"""Of an archive."""
 
 
 def camera_at_centre(
@@ -41,14 +46,9 @@ def camera_at_centre(
     )
 
 
-def read_text(path: Path, what: str) -> str:
+def text_of(path: Path, what: str) -> str:
     """The file; raises `InputError` that says what was expected."""
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; expected {what}") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as text: {error}; expected {what}") from None
+    return read_text(path, replace(DATASET, what=what))
 
 
 def floats(words: list[str], where: str) -> np.ndarray:
@@ -64,13 +64,26 @@ def floats(words: list[str], where: str) -> np.ndarray:
     return values
 
 
+class _Within:
+    """Lets through what stays inside the folder, until it is too much."""
+
+    def __init__(self) -> None:
+        self._bytes = 0
+
+    def __call__(self, member: tarfile.TarInfo, folder: str) -> tarfile.TarInfo | None:
+        self._bytes += member.size
+        if self._bytes > MOST_UNPACKED_BYTES:
+            raise tarfile.TarError(f"it unpacks to more than {MOST_UNPACKED_BYTES >> 30} GB")
+        return tarfile.data_filter(member, folder)
+
+
 @contextmanager
 def unpacked(archive: Path) -> Iterator[Path]:
     """A tar archive's content in a folder that is deleted afterwards."""
     with tempfile.TemporaryDirectory() as target:
         try:
-            with tarfile.open(archive) as tar:
-                tar.extractall(target, filter="data")
+            with open_input(archive, ARCHIVE) as file, tarfile.open(fileobj=file) as tar:
+                tar.extractall(target, filter=_Within())
         except (tarfile.TarError, OSError, EOFError) as error:
             raise InputError(f"{archive}: cannot be unpacked: {error}") from None
         yield Path(target)

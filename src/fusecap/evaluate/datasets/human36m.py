@@ -34,6 +34,7 @@ from fusecap.evaluate.datasets.recording import (
 )
 from fusecap.evaluate.datasets.safe_pickle import load_npz_object
 from fusecap.geometry.camera import Y_UP_FROM_Z_UP, Rig
+from fusecap.inputs import DATASET, open_input
 from fusecap.sources.calibration_files import fields
 
 RATE_HZ = 50.0
@@ -181,8 +182,9 @@ class _Positions:
                 raise InputError(f"{self._packed_path}: no {take.subject} {take.action}") from None
         path = self._loose / take.subject / f"{take.action}.npy"
         try:
-            values = np.load(path, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
+            with open_input(path, DATASET) as file:
+                values = np.load(file, allow_pickle=False)
+        except (OSError, ValueError, EOFError, MemoryError) as error:
             raise InputError(f"{path}: cannot be read as an array: {error}") from None
         return self._checked(values, str(path)) / 1000.0
 

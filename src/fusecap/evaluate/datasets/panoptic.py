@@ -10,7 +10,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 
@@ -25,6 +24,7 @@ from fusecap.evaluate.datasets.recording import (
     read_views,
 )
 from fusecap.geometry.camera import Rig
+from fusecap.inputs import DATASET, read_json
 from fusecap.sources.calibration_files import load_rig
 from fusecap.sources.calibration_files.loader import Y_UP_FROM
 
@@ -97,12 +97,12 @@ def read_poses(folder: Path) -> LandmarkTruth:
 
 def _bodies(path: Path) -> list[tuple[int, np.ndarray]]:
     try:
-        bodies = json.loads(path.read_text(encoding="utf-8"))["bodies"]
+        bodies = read_json(path, DATASET)["bodies"]
         found = [
             (int(body["id"]), np.array(body["joints19"], dtype=np.float64).reshape(19, 4))
             for body in bodies
         ]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise InputError(
             f"{path}: not a Panoptic pose file, or cut short ({type(error).__name__}: {error}); "
             'expected {"bodies": [{"id": ..., "joints19": 76 numbers}]}'

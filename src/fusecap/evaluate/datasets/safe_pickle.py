@@ -15,6 +15,7 @@ from __future__ import annotations
 import io
 import pickle
 import zipfile
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,35 +23,35 @@ from typing import Any
 import numpy as np
 
 from fusecap.errors import InputError
+from fusecap.inputs import DATASET, open_input
 
 
 def load_pickle(path: Path | str) -> Any:
     """The value in a pickle file, Python 2's included; raises `InputError`."""
     path = Path(path)
-    try:
-        with path.open("rb") as file:
-            return _load(file, str(path))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    with open_input(path, DATASET) as file:
+        return _load(file, str(path))
 
 
 def load_npz_object(path: Path | str, name: str) -> Any:
     """The single object that an `.npz` holds under `name`; raises `InputError`."""
     path = Path(path)
     try:
-        with zipfile.ZipFile(path) as archive, archive.open(f"{name}.npy") as member:
-            data = io.BytesIO(member.read())
+        with (
+            open_input(path, DATASET) as file,
+            zipfile.ZipFile(file) as archive,
+            archive.open(f"{name}.npy") as member,
+        ):
+            data = io.BytesIO(member.read(DATASET.most_bytes or -1))
         version = np.lib.format.read_magic(data)
         read_header = {
             (1, 0): np.lib.format.read_array_header_1_0,
             (2, 0): np.lib.format.read_array_header_2_0,
         }[version]
         shape, _, dtype = read_header(data)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
     except KeyError:
         raise InputError(f"{path}: holds no '{name}'; expected an .npz that does") from None
-    except (zipfile.BadZipFile, ValueError) as error:
+    except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, RuntimeError) as error:
         raise InputError(f"{path}: not an .npz, or cut short: {error}") from None
     if not dtype.hasobject or shape not in ((), (1,)):
         raise InputError(f"{path}: '{name}' is an array of {dtype}, expected a single object")

@@ -33,11 +33,12 @@ from jaxtyping import Float, Int
 
 from fusecap.body.landmarks import LANDMARKS, landmark_set_named
 from fusecap.errors import InputError
-from fusecap.evaluate.datasets.files import camera_at_centre, unpacked
+from fusecap.evaluate.datasets.files import camera_at_centre, text_of, unpacked
 from fusecap.evaluate.datasets.recording import DatasetSequence, last_frame, read_views
 from fusecap.evaluate.metrics import correct_limbs, identity_switches, match_people
 from fusecap.evaluate.tables import Table
 from fusecap.geometry.camera import Y_UP_FROM_Z_UP, Rig
+from fusecap.inputs import DATASET, open_input
 from fusecap.sources.calibration_files import fields, load_rig
 from fusecap.take import Take
 
@@ -181,10 +182,7 @@ def load_shelf_truth(folder: Path | str) -> ShelfTruth:
 def load_truth(path: Path | str) -> ShelfTruth:
     """Read `gt_*.txt`; raises `InputError` where it ends early or holds something else."""
     path = Path(path)
-    try:
-        words = path.read_text().split()
-    except OSError as error:
-        raise InputError(f"cannot read Shelf truth {path}: {error.strerror}") from error
+    words = text_of(path, "Shelf truth").split()
     try:
         values = iter([float(word) for word in words])
         joints, frames = int(next(values)), int(next(values))
@@ -212,9 +210,10 @@ def read_actors(path: Path) -> ShelfTruth:
     from scipy.io import loadmat
 
     try:
-        data = loadmat(path)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; expected actorsGT.mat") from None
+        with open_input(path, DATASET) as file:
+            data = loadmat(file)
+    except InputError:
+        raise
     except Exception as error:  # SciPy's reader raises whatever garbage makes it stumble over
         raise InputError(f"{path}: not a MATLAB 5 file, or cut short: {error}") from None
     if "actor3D" not in data:

@@ -37,7 +37,7 @@ from fusecap.body.landmarks import LandmarkSet, landmark_set_named
 from fusecap.body.shape import REFERENCE_HEIGHT_M, BodyShape
 from fusecap.body.skeleton import PAPER21, Skeleton
 from fusecap.errors import InputError
-from fusecap.evaluate.datasets.files import floats, read_text
+from fusecap.evaluate.datasets.files import floats, text_of
 from fusecap.evaluate.datasets.recording import BoneTruth, DatasetSequence, last_frame, read_views
 from fusecap.geometry.camera import Camera, Rig
 from fusecap.geometry.quaternions import from_wxyz
@@ -219,7 +219,7 @@ def load_sequence(
 
 def read_rig(path: Path) -> Rig:
     """`calibration.cal`; cameras are called cam1, cam2, ... in the file's order."""
-    words = read_text(path, "Total Capture's calibration.cal").split()
+    words = text_of(path, "Total Capture's calibration.cal").split()
     values = floats(words, str(path))
     if len(values) < 2:
         raise InputError(f"{path}: is empty; expected the number of cameras and their parameters")
@@ -324,7 +324,7 @@ def read_sensors(path: Path) -> tuple[Float[np.ndarray, "t 13 4"], Float[np.ndar
 
     A file that ends early gives the frames that are whole.
     """
-    lines = read_text(path, "Xsens .sensors").splitlines()
+    lines = text_of(path, "Xsens .sensors").splitlines()
     head = lines[0].split() if lines else []
     if len(head) != 2 or head[0] != str(len(SENSORS)):
         raise InputError(
@@ -354,7 +354,7 @@ def read_sensors(path: Path) -> tuple[Float[np.ndarray, "t 13 4"], Float[np.ndar
 
 def read_imu_calibration(path: Path) -> Float[np.ndarray, "13 3 3"]:
     """Rotations in the order of `SENSORS`, from lines `Name x y z w`."""
-    lines = read_text(path, "an IMU calibration").splitlines()
+    lines = text_of(path, "an IMU calibration").splitlines()
     found = {}
     for number, line in enumerate(lines[1:], start=2):
         words = line.split()
@@ -396,7 +396,7 @@ def _read_imus(sequence: Sequence, facing: Float[np.ndarray, "3 3"]) -> list[Imu
 
 
 def _read_skeleton(path: Path, width: int) -> tuple[list[str], Float[np.ndarray, "t 21 w"]]:
-    lines = read_text(path, "Total Capture's truth").splitlines()
+    lines = text_of(path, "Total Capture's truth").splitlines()
     names = lines[0].split() if lines else []
     if sorted(names) != sorted(JOINTS):
         raise InputError(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from fusecap.errors import CalibrationError
 from fusecap.geometry.camera import Camera
+from fusecap.inputs import CALIBRATION, read_json
 
 
 def json_object(path: Path) -> dict[str, Any]:
     """The object of a JSON file; raises `CalibrationError` for anything else."""
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, OSError) as error:
-        raise CalibrationError(f"{path}: not valid JSON: {error}") from None
+    data = read_json(path, CALIBRATION)
     if not isinstance(data, dict):
         raise CalibrationError(f"{path}: expected a JSON object, found a {type(data).__name__}")
     return data

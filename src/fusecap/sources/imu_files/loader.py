@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fusecap.errors import InputError, nearest
+from fusecap.inputs import SENSORS, check_input, open_input
 from fusecap.sources.imu_files.formats import NAMES, format_named
 from fusecap.sources.imu_files.track import ImuTrack
 
-_SNIFFED_CHARACTERS = 4096
+_SNIFFED_BYTES = 4096
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,8 +41,7 @@ def read_imu(
     samples, where the file does not state it.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; expected IMU samples")
+    check_input(path, SENSORS)
     if format not in NAMES:
         raise InputError(f"no IMU format '{format}'{nearest(format, NAMES)}")
     return format_named(format).read(path, sensor, rate_hz)
@@ -60,8 +60,8 @@ def imu_format_of(path: Path) -> str | None:
     if not likely or path.name.endswith(".qca.txt"):
         return None
     try:
-        with path.open(encoding="utf-8", errors="replace") as text:
-            head = text.read(_SNIFFED_CHARACTERS).lower()
-    except OSError:
+        with open_input(path, SENSORS) as file:
+            head = file.read(_SNIFFED_BYTES).decode("utf-8", "replace").lower()
+    except (InputError, OSError):
         return None
     return next((name for name in likely if format_named(name).mark.lower() in head), None)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from fusecap.errors import InputError, nearest
+from fusecap.inputs import SENSORS, read_text
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,10 +42,7 @@ class ImuTable:
 
 def read_lines(path: Path) -> list[str]:
     """The lines of a text file; raises `InputError`."""
-    try:
-        return path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    return read_text(path, SENSORS, strict=False).splitlines()
 
 
 def read_table(path: Path, first_column: str, *, units_line: bool = False) -> ImuTable:

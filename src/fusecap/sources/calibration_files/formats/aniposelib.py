@@ -19,7 +19,6 @@ and takes tables in alphabetical order, so their numbers have as many digits as 
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -28,6 +27,7 @@ from scipy.spatial.transform import Rotation
 
 from fusecap.errors import CalibrationError
 from fusecap.geometry.camera import Camera, Rig
+from fusecap.inputs import CALIBRATION, read_toml
 from fusecap.sources.calibration_files import fields
 from fusecap.sources.calibration_files.rig_format import RigFormat
 from fusecap.sources.toml_text import quoted
@@ -40,10 +40,7 @@ def read(path: Path) -> list[Camera] | None:
     """The cameras, translations in the file's unit; raises `CalibrationError`."""
     if path.suffix != ".toml" or path.is_dir():
         return None
-    try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise CalibrationError(f"{path}: not valid TOML: {error}") from None
+    data = read_toml(path, CALIBRATION)
     nested = data.get("cameras")
     if isinstance(nested, dict):
         data = {f"cam_{key}" if key.isdigit() else key: value for key, value in nested.items()}

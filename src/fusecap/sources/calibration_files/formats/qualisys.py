@@ -16,6 +16,7 @@ import numpy as np
 
 from fusecap.errors import CalibrationError
 from fusecap.geometry.camera import Camera, Rig
+from fusecap.inputs import CALIBRATION
 from fusecap.sources import safe_xml
 from fusecap.sources.calibration_files import fields
 from fusecap.sources.calibration_files.rig_format import RigFormat
@@ -30,7 +31,7 @@ def read(path: Path) -> list[Camera] | None:
     if not path.name.endswith(SUFFIXES) or path.is_dir():
         return None
     try:
-        root = safe_xml.parse(path)
+        root = safe_xml.parse(path, CALIBRATION)
     except safe_xml.XmlError as error:
         raise CalibrationError(f"{path}: {error}") from None
     return [

@@ -13,6 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from fusecap.errors import InputError
+from fusecap.inputs import SENSORS
 from fusecap.sources import safe_xml
 from fusecap.sources.imu_files.loader import ImuFormat
 from fusecap.sources.imu_files.table import chosen, number
@@ -43,7 +44,7 @@ def sensors(path: Path) -> tuple[str, ...]:
 
 def _root(path: Path) -> ElementTree.Element:
     try:
-        return safe_xml.parse(path)
+        return safe_xml.parse(path, SENSORS)
     except safe_xml.XmlError as error:
         raise InputError(f"{path}: {error}") from None
 

@@ -1,0 +1,243 @@
+"""The one entrance of files from outside: regular ones, of bounded size, before any of it is read.
+
+A pipe is waited for and a device never ends, and both say that they hold 0 bytes. So what is
+opened here is opened without waiting, is a regular file (links are followed), is no larger than
+its kind may be, and no more than that is read from it. What a text unpacks to is bounded as well:
+a dotted TOML key of n parts costs its parser n²/2 references, an array of an .npz says how large it
+wants to become.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import os
+import stat
+import tomllib
+import zipfile
+import zlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fusecap.errors import CalibrationError, InputError, SessionError, TakeError
+
+MOST_NESTED = 64
+"""Tables and lists inside each other, in TOML and JSON."""
+MOST_KEY_PARTS = 10_000_000
+"""Dots of a TOML file times those of its fullest line: 80 MB of its parser's memory."""
+MOST_ENTRIES = 1000
+"""In a zip file."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InputKind:
+    """What a file is to be, and how large it may be."""
+
+    what: str
+    """After "expected"."""
+    most_bytes: int | None
+    """Also of what the arrays of an .npz unpack to; None for what is read piece by piece."""
+    error: type[InputError] = InputError
+
+
+_MB = 1 << 20
+
+SESSION = InputKind(what="a session file", most_bytes=4 * _MB, error=SessionError)
+SETTINGS = InputKind(what="a TOML file that fusecap wrote", most_bytes=4 * _MB)
+CALIBRATION = InputKind(
+    what="a calibration of cameras", most_bytes=16 * _MB, error=CalibrationError
+)
+KEYPOINTS = InputKind(what="keypoints of one frame as JSON", most_bytes=4_000_000)
+DETECTION = InputKind(what="the record of a detection", most_bytes=64 * _MB)
+SENSORS = InputKind(what="samples of sensors", most_bytes=1024 * _MB)
+POINTS = InputKind(what="a table of points as CSV", most_bytes=16 * _MB)
+PICTURE = InputKind(what="a picture", most_bytes=256 * _MB)
+VIDEO = InputKind(what="a video", most_bytes=None)
+RECORDING = InputKind(what="a recording (.mcap)", most_bytes=None)
+TAKE = InputKind(what="a take (.npz)", most_bytes=4096 * _MB, error=TakeError)
+PRIOR = InputKind(what="a pose prior (.npz)", most_bytes=64 * _MB)
+BOARD = InputKind(what="a board (board.toml)", most_bytes=4 * _MB, error=CalibrationError)
+MOTION = InputKind(what="a motion file", most_bytes=256 * _MB)
+NETWORK = InputKind(what="a network (.onnx or OpenVINO .xml)", most_bytes=2048 * _MB)
+DATASET = InputKind(what="a file of a data set", most_bytes=2048 * _MB)
+ARCHIVE = InputKind(what="a tar archive", most_bytes=None)
+CELL = InputKind(what="a cell of an experiment", most_bytes=64 * _MB)
+
+KINDS = (
+    *(SESSION, SETTINGS, CALIBRATION, BOARD, KEYPOINTS, DETECTION, SENSORS, POINTS, PICTURE),
+    *(VIDEO, RECORDING, TAKE, PRIOR, MOTION, NETWORK, DATASET, ARCHIVE, CELL),
+)
+
+
+def open_input(path: Path | str, kind: InputKind) -> io.BufferedReader:
+    """The file, open for reading; raises `kind.error` for anything that is not such a file."""
+    flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+    try:
+        file = os.fdopen(os.open(path, flags), "rb")
+    except FileNotFoundError:
+        raise kind.error(f"{path}: no such file; expected {kind.what}") from None
+    except IsADirectoryError:
+        raise kind.error(f"{path}: is a folder; expected {kind.what}") from None
+    except (OSError, ValueError) as error:
+        raise kind.error(f"{path}: cannot be read: {_reason(error)}") from None
+    try:
+        _check(path, kind, os.fstat(file.fileno()))
+    except BaseException:
+        file.close()
+        raise
+    return file
+
+
+def check_input(path: Path | str, kind: InputKind) -> None:
+    """For a library that opens the file itself: raises as `open_input`."""
+    open_input(path, kind).close()
+
+
+def read_bytes(path: Path | str, kind: InputKind) -> bytes:
+    """All of the file; raises `kind.error`."""
+    with open_input(path, kind) as file:
+        try:
+            content = file.read() if kind.most_bytes is None else file.read(kind.most_bytes + 1)
+        except OSError as error:
+            raise kind.error(f"{path}: cannot be read: {_reason(error)}") from None
+    if kind.most_bytes is not None and len(content) > kind.most_bytes:
+        raise _too_large(path, kind, len(content))
+    return content
+
+
+def read_text(path: Path | str, kind: InputKind, *, strict: bool = True) -> str:
+    """UTF-8, with or without a byte order mark; raises `kind.error`.
+
+    Unless `strict`, bytes that are no text become question marks.
+    """
+    try:
+        return read_bytes(path, kind).decode("utf-8-sig", "strict" if strict else "replace")
+    except UnicodeDecodeError as error:
+        raise kind.error(f"{path}: cannot be read as UTF-8 text: {error}") from None
+
+
+def read_toml(path: Path | str, kind: InputKind) -> dict[str, Any]:
+    """The tables of a TOML file; raises `kind.error`, also for whole numbers beyond 64 bits."""
+    text = read_text(path, kind)
+    dots = [line.count(".") for line in text.splitlines() if not line.lstrip().startswith("#")]
+    if max(dots, default=0) * sum(dots) > MOST_KEY_PARTS:
+        raise kind.error(
+            f"{path}: a line with {max(dots)} dots; keys of so many parts are not read"
+        )
+    try:
+        return _bounded(path, kind, tomllib.loads(text))
+    except (ValueError, RecursionError) as error:
+        raise kind.error(f"{path}: not valid TOML: {_reason(error)}") from None
+
+
+def read_json(path: Path | str, kind: InputKind) -> Any:
+    """The value of a JSON file; raises `kind.error`, also for whole numbers beyond 64 bits."""
+    text = read_text(path, kind)
+    try:
+        return _bounded(path, kind, json.loads(text))
+    except (ValueError, RecursionError) as error:
+        raise kind.error(f"{path}: not valid JSON: {_reason(error)}") from None
+
+
+def read_npz(path: Path | str, kind: InputKind, names: Iterable[str]) -> dict[str, np.ndarray]:
+    """Those of the named arrays that an .npz holds; raises `kind.error`.
+
+    Other entries are not touched. What an array's header asks for must be in the file.
+    """
+    with open_input(path, kind) as file:
+        try:
+            with zipfile.ZipFile(file) as archive:
+                return _arrays(archive, kind, names)
+        except (zipfile.BadZipFile, zlib.error, EOFError) as error:
+            raise kind.error(
+                f"{path}: is damaged or cut short, or not {kind.what} ({_reason(error)})"
+            ) from None
+        except Exception as error:  # the readers raise whatever garbage makes them stumble over
+            raise kind.error(
+                f"{path}: cannot be read ({_reason(error)}); expected {kind.what}"
+            ) from None
+
+
+def _arrays(
+    archive: zipfile.ZipFile, kind: InputKind, names: Iterable[str]
+) -> dict[str, np.ndarray]:
+    entries = archive.infolist()
+    if len(entries) > MOST_ENTRIES:
+        raise ValueError(f"{len(entries)} entries, at most {MOST_ENTRIES} are read")
+    stated = {entry.filename: entry for entry in entries}
+    wanted = {name: stated[f"{name}.npy"] for name in names if f"{name}.npy" in stated}
+    unpacked = sum(entry.file_size for entry in wanted.values())
+    if kind.most_bytes is not None and unpacked > kind.most_bytes:
+        raise ValueError(f"unpacks to {unpacked} bytes, at most {kind.most_bytes} are read")
+    return {name: _array(archive, entry) for name, entry in wanted.items()}
+
+
+def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:
+    name = entry.filename
+    if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ValueError(f"{name} is packed in an unknown way")
+    with archive.open(entry) as member:
+        major, minor = np.lib.format.read_magic(member)
+        header = {
+            (1, 0): np.lib.format.read_array_header_1_0,
+            (2, 0): np.lib.format.read_array_header_2_0,
+        }.get((major, minor))
+        if header is None:
+            raise ValueError(f"{name} is an array of version {major}.{minor}")
+        shape, _, dtype = header(member)
+        if dtype.kind not in "biufSU":
+            raise ValueError(f"{name} holds {dtype}, expected numbers or text")
+        if dtype.itemsize == 0 or math.prod(shape) * dtype.itemsize > entry.file_size:
+            raise ValueError(f"{name} states {shape} of {dtype}, more than the file holds")
+    with archive.open(entry) as member:
+        return np.lib.format.read_array(member, allow_pickle=False)
+
+
+def _bounded(path: Path | str, kind: InputKind, value: Any) -> Any:
+    """`value`; raises where it is nested too deeply or holds a whole number beyond 64 bits."""
+    level = [value]
+    for _ in range(MOST_NESTED):
+        below: list[Any] = []
+        for item in level:
+            if isinstance(item, dict):
+                below += item.values()
+            elif isinstance(item, list):
+                below += item
+            elif isinstance(item, int) and abs(item) >= 1 << 63:
+                raise kind.error(f"{path}: holds a whole number of {item.bit_length()} bits")
+        if not below:
+            return value
+        level = below
+    raise kind.error(f"{path}: tables or lists stand in each other more than {MOST_NESTED} deep")
+
+
+def _check(path: Path | str, kind: InputKind, status: os.stat_result) -> None:
+    if not stat.S_ISREG(status.st_mode):
+        found = next((name for test, name in _OTHERS if test(status.st_mode)), "no regular file")
+        raise kind.error(f"{path}: is {found}; expected {kind.what} as an ordinary file")
+    if kind.most_bytes is not None and status.st_size > kind.most_bytes:
+        raise _too_large(path, kind, status.st_size)
+
+
+_OTHERS = (
+    (stat.S_ISDIR, "a folder"),
+    (stat.S_ISFIFO, "a pipe"),
+    (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+    (stat.S_ISSOCK, "a socket"),
+)
+
+
+def _too_large(path: Path | str, kind: InputKind, found: int) -> InputError:
+    return kind.error(f"{path}: has {found} bytes or more; {kind.what} may have {kind.most_bytes}")
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, RecursionError):
+        return "tables or lists stand in each other too deeply"
+    return getattr(error, "strerror", None) or str(error) or type(error).__name__
