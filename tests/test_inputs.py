@@ -240,7 +240,7 @@ def test_nothing_else_opens_files_from_outside():
         "live/health.py",  # /proc/self
         "live/devices/grabbers.py",  # cameras
         "live/recorder.py",  # writes
-        "export/overlay.py",  # writes
+        "exports/overlay.py",  # writes
         "streams/stream.py",  # opens a protocol
         "cli/view.py",  # opens a browser
         "cli/__init__.py",  # the null device
