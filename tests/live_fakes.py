@@ -127,7 +127,7 @@ class FakeEngine:
             return None
         return step_of(event.timestamp_ns, [estimate_of(event.timestamp_ns)], self._cameras)
 
-    def ready(self, timestamp_ns: int) -> bool:
+    def ready(self, timestamp_ns: int, *, ahead: bool = False) -> bool:
         samples = [e for e in self.taken[-50:] if isinstance(e, CameraSample | ImuSample)]
         return any(sample.timestamp_ns >= timestamp_ns for sample in samples)
 

@@ -159,6 +159,29 @@ class Pipeline:
         )
         return self._step
 
+    def ahead(self, now_ns: int, readings: Mapping[str, ImuReading]) -> list[Estimate]:
+        """Those of the last step at a later instant, which no picture has reached yet."""
+        views, landmarks = len(self._setup.rig), len(self._setup.landmarks.landmark_names)
+        unseen = np.full((views, landmarks, 3), np.nan)
+        unseen[:, :, 2] = 0.0
+        found = [
+            self._estimators[last.name].ahead(
+                Observation(timestamp_ns=now_ns, keypoints=unseen, imu=readings.get(last.name))
+            )
+            for last in self._step.estimates
+            if last.name in self._estimators
+        ]
+        return [estimate for estimate in found if estimate is not None]
+
+    def settled(self, lag_s: float) -> list[Estimate]:
+        """Those of the last step so long before it, as what came since corrects them."""
+        found = [
+            self._estimators[last.name].settled(lag_s)
+            for last in self._step.estimates
+            if last.name in self._estimators
+        ]
+        return [estimate for estimate in found if estimate is not None]
+
     def estimator(self, name: str) -> Estimator:
         """The estimator of a subject that has been followed."""
         return self._estimators[name]

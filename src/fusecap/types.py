@@ -188,6 +188,8 @@ class Tick:
 
     timestamp_ns: int
     """On the session's clock."""
+    ahead: bool = False
+    """From sensors and by how people move; pictures have only come to the last tick that is not."""
 
 
 Event = CameraSample | ImuSample | Command | Tick

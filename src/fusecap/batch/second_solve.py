@@ -80,7 +80,7 @@ def solve_recording(recording: Recording, progress: Progress | None = None) -> S
     commands: list[Command] = []
     for item in recording.items(progress):
         match item:
-            case RecordedEvent(event=Tick() as tick):
+            case RecordedEvent(event=Tick(ahead=False) as tick):
                 ticks_ns.append(tick.timestamp_ns)
             case RecordedEvent(event=Command() as command):
                 commands.append(command)

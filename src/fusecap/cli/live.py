@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fusecap.cli.common import Json, SessionPath, print_json
+from fusecap.cli.common import Json, SessionPath, check_choice, print_json
 from fusecap.cli.targets import TO_HELP, placed_targets, warn_if_open
 from fusecap.cli.terminal import console, err, note, progress
 from fusecap.errors import InputError
@@ -67,6 +67,15 @@ def live(
             "200 with a detector and 50 without.",
         ),
     ] = None,
+    poses: Annotated[
+        str | None,
+        typer.Option(
+            help="Which are sent: solved, when pictures are there; ahead of these, by sensors and "
+            "motion; or settled, by what was measured since. Default: as the session says, else "
+            "solved.",
+            show_default=False,
+        ),
+    ] = None,
     playback: Annotated[
         bool,
         typer.Option(
@@ -110,6 +119,7 @@ def live(
     from fusecap.live.recorder import RecordSwitch
     from fusecap.live.run import LiveOptions, LiveRun
     from fusecap.recording.layout import SUFFIX
+    from fusecap.sources.session import POSES
     from fusecap.sources.session_file import load_session
 
     if no_record and (record is not None or record_images):
@@ -117,7 +127,12 @@ def live(
     if record is not None and record.suffix != SUFFIX:
         raise InputError(f"--record {record}: a recording is one {SUFFIX} file")
     targets = placed_targets(to or [], host, other_servers=view)
+    if poses is not None:
+        check_choice("--poses", poses, POSES)
     loaded = load_session(session)
+    if poses is not None:
+        live_settings = loaded.live.model_copy(update={"poses": poses})
+        loaded = loaded.model_copy(update={"live": live_settings})
     played = _playback(
         playback,
         loop=loop,
@@ -237,10 +252,15 @@ def _announce(
     session = run.setup.session
     sensors = sum(len(subject.imus) for subject in session.subjects)
     pace = ", or sooner where all is there" if run.eager else ""
+    sends = {
+        "solved": "",
+        "ahead": ", and sent ahead of that",
+        "settled": f", and sent {1e3 * session.live.settle_s:.0f} ms later",
+    }[session.live.poses]
     lines = [
         f"{session.settings.name}: {len(session.cameras)} cameras, {len(session.subjects)} people "
         f"with {sensors} sensors; {run.rate_hz:g} instants/s, each solved "
-        f"{1e3 * run.delay_s:.0f} ms after exposure{pace}; Ctrl-C ends it"
+        f"{1e3 * run.delay_s:.0f} ms after exposure{pace}{sends}; Ctrl-C ends it"
     ]
     for where in streaming.addresses if streaming else ():
         lines += [f"  {name} -> {address}" for name, address in where.items()]

@@ -6,14 +6,16 @@
 
 A `Tick` solves one instant with the samples that have come so far; nothing here knows what time it
 is. So an event sequence determines every pose, bit for bit, whenever and on whatever machine it is
-played back.
+played back. Poses go out as `[live] poses` says: of that instant, of one before it that has
+settled, or of a later one, for which ticks `ahead` ask.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,6 +25,8 @@ from fusecap.engine.sensors import Sensors
 from fusecap.errors import SessionError
 from fusecap.pipeline import Pipeline, Step
 from fusecap.setup import SessionSetup, setup_of
+from fusecap.solve.options import SolverOptions
+from fusecap.sources.session import LiveSettings
 from fusecap.types import (
     CameraSample,
     Command,
@@ -34,20 +38,22 @@ from fusecap.types import (
     ImuSample,
 )
 
+FARTHEST_AHEAD_S = 0.3
+"""Of pictures: longer nobody goes on as before."""
 LOST_S = 1.0
 """Without any measurement before a person is said to be lost."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LiveStep:
-    """One instant: what was measured, what the stages made of it, and what is sent."""
+    """The last instant that was solved: its measurements, what was made of it, and what is sent."""
 
     timestamp_ns: int
-    """On the session's clock."""
+    """Of the poses that are sent, on the session's clock."""
     detections: Detections
-    """Interpolated to the instant."""
+    """Interpolated to the instant that was solved."""
     readings: Mapping[str, ImuReading]
-    """By subject, interpolated to the instant."""
+    """By subject, interpolated to the instant of the tick."""
     step: Step
     """As sorted and solved."""
     people: Mapping[str, Estimate | None]
@@ -67,7 +73,11 @@ class Engine:
             len(setup.landmarks.landmark_names),
         )
         self._sensors = Sensors(session.subjects)
-        self._pipeline = Pipeline(setup_of(session, setup.rig, setup.landmarks))
+        solved = setup_of(session, setup.rig, setup.landmarks)
+        self._live = session.live
+        self._pipeline = Pipeline(
+            replace(solved, options=_with_room(solved.options, session.live, solved.rate_hz))
+        )
         self._hold_s = session.live.hold_s
         self._people = {subject.name: Continuity(self._hold_s) for subject in session.subjects}
         """In a lasting order."""
@@ -77,26 +87,35 @@ class Engine:
         }
         self._present: set[str] = set()
         self._seen: set[str] = set()
+        self._detections = self._cameras.detections(0)
         self._step = Step(updates=(), estimates=())
         self._last_ns: int | None = None
+        self._sent_ns: int | None = None
 
     def take(self, event: Event) -> LiveStep | None:
-        """A step for a tick, else None; also for a tick that is not after the last one."""
+        """A step where poses are to be sent, else None; also for a tick not after the last one."""
         if isinstance(event, CameraSample):
             self._cameras.take(event)
         elif isinstance(event, ImuSample):
             self._sensors.take(event)
         elif isinstance(event, Command):
             self._obey(event)
+        elif event.ahead:
+            return self._look_ahead(event.timestamp_ns)
         elif self._last_ns is None or event.timestamp_ns > self._last_ns:
             self._last_ns = event.timestamp_ns
             return self._solve(event.timestamp_ns)
         return None
 
-    def ready(self, timestamp_ns: int) -> bool:
-        """Whether every fresh source has a sample at or after an instant; not without any."""
-        waiting = [*self._cameras.waiting(timestamp_ns), *self._sensors.waiting(timestamp_ns)]
-        return bool(waiting) and not any(waiting)
+    def ready(self, timestamp_ns: int, *, ahead: bool = False) -> bool:
+        """Whether every fresh source has a sample at or after an instant; not without any.
+
+        Ahead of pictures sensors are enough, and without any nothing is waited for.
+        """
+        waiting = self._sensors.waiting(timestamp_ns)
+        if not ahead:
+            waiting += self._cameras.waiting(timestamp_ns)
+        return (ahead or bool(waiting)) and not any(waiting)
 
     def expected(self, timestamp_ns: int) -> list[np.ndarray]:
         """Per camera (m, k, 3) people expected at an instant: x, y [px], confidence."""
@@ -107,11 +126,35 @@ class Engine:
         """R_ib (3, 3) by subject and bone, as stated or taken from a T-pose."""
         return self._sensors.mountings
 
-    def _solve(self, now_ns: int) -> LiveStep:
-        detections = self._cameras.detections(now_ns)
+    def _solve(self, now_ns: int) -> LiveStep | None:
         readings = self._sensors.readings(now_ns)
-        step = self._pipeline.step(detections, readings)
-        solved = {estimate.name: estimate for estimate in step.estimates}
+        self._detections = self._cameras.detections(now_ns)
+        self._step = self._pipeline.step(self._detections, readings)
+        if self._live.poses == "ahead":
+            return None
+        if self._live.poses == "solved":
+            return self._send(now_ns, self._step.estimates, readings)
+        settled = self._pipeline.settled(self._live.settle_s)
+        settled_ns = now_ns - round(self._live.settle_s * 1e9)
+        return self._send(
+            max((s.timestamp_ns for s in settled), default=settled_ns), settled, readings
+        )
+
+    def _look_ahead(self, now_ns: int) -> LiveStep | None:
+        if self._last_ns is None:
+            return None
+        readings = self._sensors.readings(now_ns)
+        if now_ns <= self._last_ns:
+            return self._send(self._last_ns, self._step.estimates, readings)
+        return self._send(now_ns, self._pipeline.ahead(now_ns, readings), readings)
+
+    def _send(
+        self, now_ns: int, estimates: Iterable[Estimate], readings: Mapping[str, ImuReading]
+    ) -> LiveStep | None:
+        if self._sent_ns is not None and now_ns <= self._sent_ns:
+            return None
+        self._sent_ns = now_ns
+        solved = {estimate.name: estimate for estimate in estimates}
         for name in solved:
             if name not in self._people:
                 self._people[name] = Continuity(self._hold_s)
@@ -122,12 +165,11 @@ class Engine:
             silent_ns = now_ns - (continuity.measured_ns or now_ns)
             people[name] = continuity.update(estimate, (views, name in readings), now_ns)
             self._watch(name, continuity.measured_ns == now_ns, silent_ns * 1e-9)
-        self._step = step
         return LiveStep(
             timestamp_ns=now_ns,
-            detections=detections,
+            detections=self._detections,
             readings=readings,
-            step=step,
+            step=self._step,
             people=people,
         )
 
@@ -191,3 +233,17 @@ class Engine:
                 ahead = estimate.bone_rotation_in_world[0, :, 2]
                 return float(np.arctan2(ahead[0], ahead[2]))
         return self._tpose_facing_rad[name]
+
+
+def _with_room(options: SolverOptions, live: LiveSettings, rate_hz: float) -> SolverOptions:
+    """With a window in which poses can settle, and room ahead of it."""
+    if live.poses == "solved":
+        return options
+    if not options.together:
+        raise SessionError(
+            f'[live] poses = "{live.poses}" needs instants that are solved together; leave out '
+            "[estimator] window = 1 and weights that switch all terms between instants off"
+        )
+    if live.poses == "ahead":
+        return replace(options, ahead=math.ceil(FARTHEST_AHEAD_S * rate_hz))
+    return replace(options, window=max(options.window, math.ceil(live.settle_s * rate_hz) + 1))

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from fusecap.body.landmarks import LandmarkOffsets, LandmarkSet
 from fusecap.evaluate.metrics import aligned_error_m, position_error_m, summarize
 from fusecap.evaluate.score import score_take
-from fusecap.evaluate.simulated_solve import live_takes, solve_simulation
+from fusecap.evaluate.simulated_solve import ahead_takes, live_takes, solve_simulation
 from fusecap.evaluate.simulator import Simulation
 from fusecap.evaluate.twin import (
     GROUPS,
@@ -34,6 +34,7 @@ LIMBS_12 = tuple(
 """The keypoints that Malleson et al. (2017) used: K12 of the paper's table 3."""
 
 LATE_S = 0.1
+"""Of poses that have settled, and of the pictures that others are ahead of."""
 _SPINE = ("spine", "spine1", "spine2", "spine3")
 """The joints that Human3.6M does not have; 17 of 21 remain [1, sec. 4.1.3]."""
 
@@ -63,7 +64,8 @@ class TwinCell:
     """What the solver knows of the bones: true lengths, or proportions of the stature."""
     seed: int = 0
     live: bool = False
-    """Also score what a live run has: the newest pose, and one settled for `LATE_S`."""
+    """Also score what a live run has: the newest pose, one settled for `LATE_S`, and where pictures
+    come as late the last one that they reached and one ahead of them."""
     trace: bool = False
     """Return the places of the root and of a wrist over time as well."""
 
@@ -88,6 +90,9 @@ def solve_cell(cell: TwinCell) -> dict[str, Any]:
         newest, settled = live_takes(simulation, options=options, lag_s=LATE_S)
         result["newest"] = asdict(score_take(newest, simulation.truth, gate_m=gate_m))
         result["settled"] = asdict(score_take(settled, simulation.truth, gate_m=gate_m))
+        seen, ahead = ahead_takes(simulation, options=options, late_s=LATE_S)
+        result["seen"] = asdict(score_take(seen, simulation.truth, gate_m=gate_m))
+        result["ahead"] = asdict(score_take(ahead, simulation.truth, gate_m=gate_m))
     if cell.trace:
         result["root_m"] = np.round(solved.take.theta[0, :, :3], 5).tolist()
         result["true_root_m"] = np.round(simulation.truth.theta[0, :, :3], 5).tolist()

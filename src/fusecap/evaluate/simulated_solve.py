@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 
@@ -55,13 +55,40 @@ def live_takes(
         step = pipeline.step(instants.detections(instant), instants.readings(instant))
         times_ns.append(simulation.detections[instant].timestamp_ns)
         newest[times_ns[-1]] = {estimate.name: estimate for estimate in step.estimates}
-        for estimate in step.estimates:
-            late = pipeline.estimator(estimate.name).settled(lag_s)
-            if late is not None:
-                settled.setdefault(late.timestamp_ns, {})[late.name] = late
+        for late in pipeline.settled(lag_s):
+            settled.setdefault(late.timestamp_ns, {})[late.name] = late
         if progress:
             progress("solving as live", instant + 1, len(instants))
     return _take(setup, times_ns, newest), _take(setup, times_ns, settled)
+
+
+def ahead_takes(
+    simulation: Simulation,
+    *,
+    late_s: float,
+    options: SolverOptions | None = None,
+    progress: Progress | None = None,
+) -> tuple[Take, Take]:
+    """What is known at each instant when pictures come `late_s` after it, and sensors at once.
+
+    The last pose that pictures reached, under the time at which it is seen; and the pose ahead.
+    """
+    instants = _Instants(simulation)
+    late = round(late_s * simulation.rate_hz)
+    options = replace(options or SolverOptions(), ahead=late)
+    setup = setup_of_simulation(simulation, options=options)
+    pipeline = Pipeline(setup)
+    times_ns = [detections.timestamp_ns for detections in simulation.detections]
+    seen: dict[int, dict[str, Estimate]] = {}
+    ahead: dict[int, dict[str, Estimate]] = {}
+    for instant, now_ns in enumerate(times_ns[late:]):
+        step = pipeline.step(instants.detections(instant), instants.readings(instant))
+        found = pipeline.ahead(now_ns, instants.readings(instant + late))
+        seen[now_ns] = {e.name: replace(e, timestamp_ns=now_ns) for e in step.estimates}
+        ahead[now_ns] = {estimate.name: estimate for estimate in found}
+        if progress:
+            progress("looking ahead", instant + 1, len(times_ns) - late)
+    return _take(setup, times_ns, seen), _take(setup, times_ns, ahead)
 
 
 def _take(

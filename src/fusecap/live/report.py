@@ -43,6 +43,8 @@ class LiveReport:
     """That was asked for."""
     delay_s: float
     eager: bool
+    poses: str
+    """Which were sent: solved, ahead of pictures, or settled."""
     instants: int
     """Solved."""
     skipped: int

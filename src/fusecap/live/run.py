@@ -21,7 +21,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 from fusecap.detect.detector import Detector
-from fusecap.engine.engine import Engine
+from fusecap.engine.engine import FARTHEST_AHEAD_S, Engine
+from fusecap.errors import SessionError
 from fusecap.live.detection import DetectionLoop
 from fusecap.live.devices.source import Delivery, SessionClock, Source
 from fusecap.live.feed import Feed
@@ -88,6 +89,11 @@ class LiveRun:
         usual_s = DELAY_S if detector is None else DELAY_WITH_DETECTOR_S
         self.delay_s = usual_s if delay_s is None else delay_s
         self.eager = detector is None if eager is None else eager
+        if live.poses == "ahead" and self.delay_s > FARTHEST_AHEAD_S:
+            raise SessionError(
+                f'poses = "ahead" goes {FARTHEST_AHEAD_S:g} s beyond pictures at most, and these '
+                f"are {self.delay_s:g} s late; state a shorter delay, or send them solved"
+            )
         self._engine = engine or Engine(setup)
         self._inbox = Inbox(self.clock)
         self._inputs = inputs_of(setup)
@@ -122,6 +128,7 @@ class LiveRun:
             rate_hz=self.rate_hz,
             delay_ns=round(1e9 * self.delay_s),
             eager=self.eager,
+            ahead=live.poses == "ahead",
             clock=self.clock,
             latency=self.latency,
             on_event=lambda event, arrival_ns: self._listeners.tell("on_event", event, arrival_ns),
@@ -312,6 +319,7 @@ class LiveRun:
             rate_hz=self.rate_hz,
             delay_s=self.delay_s,
             eager=self.eager,
+            poses=self.setup.session.live.poses,
             instants=instants,
             skipped=solving.skipped,
             late_share=(solving.late + solving.skipped) / max(instants + solving.skipped, 1),

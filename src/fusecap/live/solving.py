@@ -5,6 +5,10 @@ was exposed then has come through the detector; or sooner, where `eager`, as soo
 that is fresh has a sample from then or later. An instant that is late is still solved when the one
 after it is not due yet; who is further behind goes on with the newest instant that is due, and what
 lies between is counted as skipped. So a machine that is too slow loses instants, never its delay.
+
+With `ahead` there are two fronts. Instants that pictures have reached are solved as above, and send
+nothing; what is sent is the newest instant, as soon as sensors have reached it, at the latest 20 ms
+after it.
 """
 
 from __future__ import annotations
@@ -18,6 +22,7 @@ from typing import Protocol
 import numpy as np
 
 from fusecap.engine.engine import LiveStep
+from fusecap.engine.sensors import HOLD_S
 from fusecap.live.devices.source import SessionClock
 from fusecap.live.health import Meter
 from fusecap.live.inbox import Inbox
@@ -30,6 +35,8 @@ from fusecap.live.latency import (
 )
 from fusecap.types import Command, Event, Tick
 
+AHEAD_NS = round(HOLD_S * 1e9)
+"""For so long a sensor's last sample holds: the next is not waited for any longer."""
 _EARLY_NS = 1_000_000
 """Before an instant is due, samples that wait are taken: it leaves less to do when it is."""
 _LOOK_AGAIN_NS = 1_000_000
@@ -51,8 +58,8 @@ class LiveEngine(Protocol):
         """One event; a step where it was a tick."""
         ...
 
-    def ready(self, timestamp_ns: int) -> bool:
-        """Every fresh source has a sample at or after this time."""
+    def ready(self, timestamp_ns: int, *, ahead: bool = False) -> bool:
+        """Every fresh source has a sample at or after this time; `ahead`: every fresh sensor."""
         ...
 
     def expected(self, timestamp_ns: int) -> Sequence[np.ndarray]:
@@ -84,6 +91,7 @@ class Solving:
         rate_hz: float,
         delay_ns: int,
         eager: bool,
+        ahead: bool,
         clock: SessionClock,
         latency: LatencyBook,
         on_event: Callable[[Event, int], None],
@@ -110,6 +118,12 @@ class Solving:
         self._rate_hz = rate_hz
         self._delay_ns = delay_ns
         self._eager = eager
+        self._ahead = ahead
+        self._next = 0
+        """That pictures reach, with `ahead`."""
+        self._detections_ns: int | None = None
+        """The last instant that was looked at."""
+        self._both_sides: set[int] = set()
         self._clock = clock
         self._latency = latency
         self._on_event = on_event
@@ -137,38 +151,56 @@ class Solving:
         return not self._thread.is_alive()
 
     def _run(self) -> None:
-        instant = int(1e-9 * self._clock.now_ns() * self._rate_hz) + 1
-        while self._wait_for(instant):
+        instant = self._next = int(1e-9 * self._clock.now_ns() * self._rate_hz) + 1
+        delay_ns = AHEAD_NS if self._ahead else self._delay_ns
+        eager = self._ahead or self._eager
+        while self._wait_for(instant, delay_ns, eager=eager):
             timestamp_ns = self._time_ns(instant)
-            lateness_ns = self._clock.now_ns() - timestamp_ns - self._delay_ns
+            lateness_ns = self._clock.now_ns() - timestamp_ns - delay_ns
             self.late += lateness_ns > _LATE_PERIODS * 1e9 / self._rate_hz
-            self._solve(timestamp_ns)
-            newest = int(1e-9 * (self._clock.now_ns() - self._delay_ns) * self._rate_hz)
-            following = newest if newest > instant + 2 else instant + 1
+            if self._ahead:
+                self._solve_seen()
+            self._solve(Tick(timestamp_ns=timestamp_ns, ahead=self._ahead))
+            following = self._following(instant, delay_ns)
             self.skipped += following - instant - 1
             instant = following
+
+    def _solve_seen(self) -> None:
+        """Instants whose pictures are there, or are no longer waited for."""
+        while not self._stopping.is_set():
+            timestamp_ns = self._time_ns(self._next)
+            due = self._clock.now_ns() >= timestamp_ns + self._delay_ns
+            if not (due or (self._eager and self._engine.ready(timestamp_ns))):
+                return
+            self._solve(Tick(timestamp_ns=timestamp_ns))
+            self._next = self._following(self._next, self._delay_ns)
+
+    def _following(self, instant: int, delay_ns: int) -> int:
+        """The next one to solve."""
+        newest = int(1e-9 * (self._clock.now_ns() - delay_ns) * self._rate_hz)
+        return newest if newest > instant + 2 else instant + 1
 
     def _time_ns(self, instant: int) -> int:
         return round(instant * 1e9 / self._rate_hz)
 
-    def _wait_for(self, instant: int) -> bool:
+    def _wait_for(self, instant: int, delay_ns: int, *, eager: bool) -> bool:
         """Take what arrives until the instant can be solved; False at the end of the run."""
         timestamp_ns = self._time_ns(instant)
-        due_ns = timestamp_ns + self._delay_ns
-        if not self._eager:
+        due_ns = timestamp_ns + delay_ns
+        if not eager:
             self._inbox.wait_until(due_ns - _EARLY_NS)
             self._take_waiting()
         while not self._stopping.is_set():
             now_ns = self._clock.now_ns()
-            if self._eager and now_ns < timestamp_ns:
+            if eager and now_ns < timestamp_ns:
                 self._inbox.wait_until(timestamp_ns)
                 continue
             self._take_waiting()
-            if now_ns >= due_ns or (self._eager and self._engine.ready(timestamp_ns)):
+            if now_ns >= due_ns or (eager and self._engine.ready(timestamp_ns, ahead=self._ahead)):
                 return True
-            if self._eager:
+            if eager:
                 self._inbox.wait_until(min(due_ns, now_ns + _LOOK_AGAIN_NS))
-            self._inbox.wait_until(due_ns, or_arrival=self._eager)
+            self._inbox.wait_until(due_ns, or_arrival=eager)
         return False
 
     def _take_waiting(self) -> None:
@@ -178,22 +210,22 @@ class Solving:
                 self._arrivals.note(event, arrival_ns)
             self._on_event(event, arrival_ns)
 
-    def _solve(self, timestamp_ns: int) -> None:
+    def _solve(self, tick: Tick) -> None:
         start_ns = self._clock.now_ns()
-        tick = Tick(timestamp_ns=timestamp_ns)
         step = self._engine_takes(tick)
         end_ns = self._clock.now_ns()
         self._on_event(tick, start_ns)
+        if not tick.ahead:
+            last_arrival_ns, self._both_sides = self._arrivals.instant(tick.timestamp_ns)
+            self._latency.solved(tick.timestamp_ns, last_arrival_ns)
+            if last_arrival_ns is not None:
+                self._latency.add(LAST_SAMPLE_TO_SOLVE, start_ns - last_arrival_ns)
+        self._latency.add(SOLVE, end_ns - start_ns)
         if step is None:
             return
-        last_arrival_ns, both_sides = self._arrivals.instant(timestamp_ns)
-        self._latency.solved(timestamp_ns, last_arrival_ns)
         self._on_step(step, end_ns)
-        self._latency.add(SOLVE, end_ns - start_ns)
-        self._latency.add(EXPOSURE_TO_POSE, end_ns - timestamp_ns)
-        if last_arrival_ns is not None:
-            self._latency.add(LAST_SAMPLE_TO_SOLVE, start_ns - last_arrival_ns)
-        self._tally(step, both_sides, end_ns)
+        self._latency.add(EXPOSURE_TO_POSE, end_ns - step.timestamp_ns)
+        self._tally(step, end_ns)
         if self._expect is not None:
             self._expect(lambda: self._engine.expected(self._clock.now_ns()))
 
@@ -205,13 +237,15 @@ class Solving:
             self._failed(error)
             return None
 
-    def _tally(self, step: LiveStep, both_sides: set[int], now_ns: int) -> None:
+    def _tally(self, step: LiveStep, now_ns: int) -> None:
         self.solves.add(now_ns)
         cameras = len(step.detections.people)
         looked = step.detections.looked or (True,) * cameras
         looking = {camera for camera in range(cameras) if looked[camera]}
-        self.looked += bool(looking)
-        self.complete += bool(looking) and looking <= both_sides
+        if step.detections.timestamp_ns != self._detections_ns:
+            self._detections_ns = step.detections.timestamp_ns
+            self.looked += bool(looking)
+            self.complete += bool(looking) and looking <= self._both_sides
         measured = {estimate.name for estimate in step.step.estimates}
         for name, estimate in step.people.items():
             if estimate is None or (name not in self.people and len(self.people) >= _PEOPLE):

@@ -83,7 +83,8 @@ def command_message(command: Command) -> str:
 
 
 def tick_message(tick: Tick) -> str:
-    return f'{{"timestamp_ns":{tick.timestamp_ns}}}'
+    ahead = ',"ahead":true' if tick.ahead else ""
+    return f'{{"timestamp_ns":{tick.timestamp_ns}{ahead}}}'
 
 
 def pose_message(estimate: Estimate) -> str:
@@ -161,7 +162,7 @@ SCHEMAS = {
             kind=_TEXT,
             subject=_TEXT,
         ),
-        _object(TICK, "Solve this instant now.", timestamp_ns=_TIME),
+        _object(TICK, "Solve this instant now.", timestamp_ns=_TIME, ahead={"type": "boolean"}),
         _object(
             POSE,
             "One person as solved and sent; world right-handed, y up, floor y = 0.",
@@ -222,7 +223,7 @@ def _command(values: Mapping[str, Any], known: Known) -> Command:
 
 
 def _tick(values: Mapping[str, Any], known: Known) -> Tick:
-    return Tick(timestamp_ns=_time_ns(values))
+    return Tick(timestamp_ns=_time_ns(values), ahead=values.get("ahead") is True)
 
 
 def _pose(values: Mapping[str, Any], known: Known) -> dict[str, Any]:

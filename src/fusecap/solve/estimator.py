@@ -2,6 +2,7 @@
 
     update(observation) -> Estimate        the newest instant, first alone, then in its window
     settled(lag_s)      -> Estimate        an instant of the window, as what came since corrects it
+    ahead(observation)  -> Estimate        one that pictures have not reached; changes none of these
 
 Time is an argument; an `Estimator` holds no clock or thread, so a recording replays bit for bit and
 several subjects can be updated on threads.
@@ -22,6 +23,7 @@ from fusecap.body.prior import PosePrior
 from fusecap.body.shape import BodyShape
 from fusecap.body.skeleton import PAPER21, Skeleton
 from fusecap.geometry.camera import Rig
+from fusecap.kernels.lie import wrap_pose
 from fusecap.solve.body_measure import BodyMeasure
 from fusecap.solve.initialize import (
     neutral_pose,
@@ -92,12 +94,20 @@ class Estimator:
         )
         self._landmark_bones = landmarks.bones(skeleton)
         together = self.solver.options.together
-        self._motion = WindowSolver(self.solver, self.solver.options.window) if together else None
+        self._room = self.solver.options.ahead
+        self._motion = (
+            WindowSolver(self.solver, self.solver.options.window, ahead=self._room)
+            if together
+            else None
+        )
+        self._coming: deque[tuple[Observation, np.ndarray]] = deque(maxlen=max(self._room, 1))
+        """Instants `ahead` of the window, and their poses."""
         self._recent: deque[Estimate] = deque(maxlen=self.solver.options.window)
         """Those of the instants in the window, as they were when new."""
         self._turn_shares = turn_shares(skeleton)
         self._sigmas = unknown(skeleton)
         self._measured_ns = 0
+        self._views = np.zeros(len(rig), dtype=bool)
         self._solution: Solution | None = None
         self._previous: Observation | None = None
         self._sites: list[np.ndarray] = []
@@ -186,6 +196,7 @@ class Estimator:
         else:
             spread = self.solver.spread()
         self._sigmas = sigmas(*spread, self._turn_shares)
+        self._views = views
         estimate = self._estimate(observation.timestamp_ns, solution, views, solve_s)
         self._measured_ns = observation.timestamp_ns
         if sound:
@@ -208,6 +219,42 @@ class Estimator:
         position, rotation = self.solver.posed(theta)
         return replace(
             then, theta=theta, bone_position_in_world_m=position, bone_rotation_in_world=rotation
+        )
+
+    def ahead(self, observation: Observation) -> Estimate | None:
+        """The pose at an instant that pictures have not reached: from sensors, and as it goes on.
+
+        `update` at that instant, or one before, corrects it; nothing else depends on it. None
+        before there is a motion to go on from.
+        """
+        motion, now_ns = self._motion, observation.timestamp_ns
+        if motion is None or self._solution is None or not motion.count:
+            return None
+        while self._coming and self._coming[0][0].timestamp_ns <= self._last_ns:
+            self._coming.popleft()
+        last = self._coming[-1] if self._coming else None
+        if now_ns <= (last[0].timestamp_ns if last else self._last_ns):
+            return None
+        self._coming.append((observation, last[1] if last else motion.pose()))
+        if not motion.goes_on(self._coming[0][0].timestamp_ns):
+            return None
+        started = time.perf_counter()
+        found = motion.ahead(self._coming, _MAX_STEPS)
+        for row, theta in enumerate(found.theta):
+            self._coming[row] = (self._coming[row][0], theta)
+        theta = found.theta[-1].copy()
+        if not np.isfinite(theta).all():
+            return None
+        wrap_pose(theta)
+        position, rotation = self.solver.posed(theta)
+        bars = sigmas(found.turn_rad2, found.place_m2, self._turn_shares)
+        return replace(
+            self._estimate(now_ns, self._solution, self._views, time.perf_counter() - started),
+            theta=theta,
+            bone_position_in_world_m=position,
+            bone_rotation_in_world=rotation,
+            bone_sigma_deg=bars.bone_deg,
+            position_sigma_m=bars.position_m,
         )
 
     def _in_window(

@@ -95,6 +95,8 @@ class SolverOptions:
     initial_damping: float = 1e-2
     window: int = 8
     """Instants that a live pose is solved together with, itself among them; 1: each alone."""
+    ahead: int = 0
+    """Instants that a pose may be ahead of pictures, by sensors and as the motion goes on."""
     floor_radius_m: float = 0.05
     """Distance kept between the floor and the ankle and toe joints [1, eq. 16]."""
 

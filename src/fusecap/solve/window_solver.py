@@ -8,6 +8,9 @@ nor held.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float
 
@@ -28,6 +31,14 @@ _KEPT_PROMISE = 0.5
 """Of two steps that were needed, nearly all have a first one farther than this from its promise."""
 _UP_M_S2 = np.array([0.0, GRAVITY_M_S2, 0.0])
 _RIDGE = 1e-9
+
+
+class Ahead(NamedTuple):
+    """Poses (n, P) of instants after those of a window, and `newest_spread` of the last."""
+
+    theta: Float[np.ndarray, "n p"]
+    turn_rad2: Float[np.ndarray, " b"]
+    place_m2: Float[np.ndarray, " b"]
 
 
 class Workspace:
@@ -55,13 +66,21 @@ class Workspace:
 class WindowSolver:
     """The latest instants of the subject of a `PoseSolver`; allocates little but results."""
 
-    def __init__(self, solver: PoseSolver, size: int, workspace: Workspace | None = None) -> None:
-        """A window of up to `size` instants, three at least."""
+    def __init__(
+        self,
+        solver: PoseSolver,
+        size: int,
+        workspace: Workspace | None = None,
+        *,
+        ahead: int = 0,
+    ) -> None:
+        """A window of up to `size` instants, three at least, with room for some `ahead` of it."""
         self._solver = solver
         cameras, landmarks = solver.view_shape
         sensors = len(solver.sites.bone)
         self.size = size
         self.count = 0
+        size += ahead
         self._times_ns = np.zeros(size, dtype=np.int64)
         self._theta = np.zeros((size, solver.skeleton.pose_size))
         self._measured = groups.Window(
@@ -112,6 +131,12 @@ class WindowSolver:
             self.reset()
         if self.count == self.size:
             self.fold(1)
+        row = self.count
+        self._append(observation, theta)
+        self._feet_m[row] = self._solver.posed(theta)[0][self._solver.model.floor.bone]
+        self._measured.contact[row] = self._contact.at(row, self._measured, self._feet_m)
+
+    def _append(self, observation: Observation, theta: Float[np.ndarray, " p"]) -> None:
         row, measured = self.count, self._measured
         self._times_ns[row] = observation.timestamp_ns
         self._theta[row] = theta
@@ -126,8 +151,7 @@ class WindowSolver:
         measured.present[row] = np.isfinite(measured.rotation[row, :, 0, 0])
         if row:
             measured.steps[row - 1] = (self._times_ns[row] - self._times_ns[row - 1]) * 1e-9
-        self._feet_m[row] = self._solver.posed(theta)[0][self._solver.model.floor.bone]
-        measured.contact[row] = self._contact.at(row, measured, self._feet_m)
+        measured.contact[row] = 0.0
         self.count += 1
 
     def refine(self, max_iterations: int, tolerance: float | None = None) -> None:
@@ -166,6 +190,22 @@ class WindowSolver:
             cost, damping = trial_cost, max(damping / 10.0, _LEAST_DAMPING)
             if done:
                 break
+
+    def ahead(
+        self, coming: Sequence[tuple[Observation, Float[np.ndarray, " p"]]], max_iterations: int
+    ) -> Ahead:
+        """Instants that only sensors have reached, each with where it begins; see `Ahead`.
+
+        They go on from the window, which stays as it is, and are as many as there is room for.
+        Nobody is said to stand in them: only pictures, or more time, could tell.
+        """
+        kept, theta = self.count, self._theta[: self.count].copy()
+        for observation, start in coming:
+            self._append(observation, start)
+        self.refine(max_iterations)
+        found = Ahead(self._theta[kept : self.count].copy(), *self.newest_spread())
+        self.count, self._theta[:kept] = kept, theta
+        return found
 
     def fold(self, leaving: int) -> None:
         """The oldest leave; what they say of the two after them stays, linearised here.

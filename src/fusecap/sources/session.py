@@ -324,6 +324,10 @@ class EstimatorSettings(_Table):
     floor_radius_m: NotNegative | None = None
 
 
+POSES = ("solved", "ahead", "settled")
+"""That a live run can send."""
+
+
 class LiveSettings(_Table):
     """`[live]`: of `fusecap live`."""
 
@@ -332,6 +336,11 @@ class LiveSettings(_Table):
     eager: Flag | None = None
     """Solve as soon as every source has what an instant needs, at the latest after the delay;
     None: where keypoints come from outside."""
+    poses: Annotated[str, _one_of(POSES)] = "solved"
+    """Which are sent: solved with the pictures that `delay_s` waits for, ahead of these by sensors
+    and motion, or `settle_s` after they were solved."""
+    settle_s: Annotated[Positive, Field(le=1.0)] = 0.1
+    """What comes so much later still corrects settled poses."""
     hold_s: NotNegative = 10.0
     """How long a person whom nothing measures is still sent, in the last pose and with growing
     error bars."""

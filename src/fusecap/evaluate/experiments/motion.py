@@ -84,11 +84,28 @@ def report(settings: Settings, results: Results) -> Report:
         tables.append(
             Table(title=title, columns=("input", *COLUMNS, *truth), rows=tuple(rows), digits=digits)
         )
+    tables.append(_ahead(settings, results))
     tables.append(_error_bars(settings, results))
     return Report(
         tables=tuple(tables),
         findings=tuple(_findings(settings, results)),
         plots={"": _plot(settings, results)},
+    )
+
+
+def _ahead(settings: Settings, results: Results) -> Table:
+    """What is known of this very moment while its pictures are still on their way."""
+    rows: list[tuple[Value, ...]] = []
+    for cameras, imus in _inputs(settings):
+        cells = _row(settings, cameras, imus, alone=False)
+        errors = (ERRORS["global position mm"], ERRORS["orientation deg"])
+        values = [results.mean(cells, kind, *e) for e in errors for kind in ("seen", "ahead")]
+        rows.append((_named(cameras, imus), *values))
+    return Table(
+        title=f"Pictures {1e3 * LATE_S:.0f} ms late: global position mm, orientation deg",
+        columns=("input", "seen: mm", "ahead: mm", "seen: deg", "ahead: deg"),
+        rows=tuple(rows),
+        note="Seen: the last pose that pictures reached; ahead: by sensors and motion since.",
     )
 
 
