@@ -180,6 +180,14 @@ def test_session_without_cameras_yields_readings(tmp_path):
     assert data.imus[0].bones == ("hips",)
 
 
+def test_without_cameras_a_session_is_solved_as_often_as_sensors_measure(tmp_path):
+    imu_session(tmp_path)
+    edit(tmp_path / "session.toml", "rate_hz = 50\n", "")
+    data = open_session(load_session(tmp_path))
+    assert data.session.settings.rate_hz == pytest.approx(100.0)
+    assert len(data.times_s) == 200 and np.allclose(np.diff(data.times_s), 0.01)
+
+
 def test_tpose_gives_the_offset_of_the_sensor(tmp_path):
     imu_session(tmp_path, extra="")
     edit(tmp_path / "session.toml", 'name = "A"', 'name = "A"\ntpose_s = [0, 0.5]')

@@ -8,7 +8,7 @@ session's rate are not interpolated at all.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
@@ -116,6 +116,8 @@ class SessionData:
 class OpenedInputs:
     """What a session names, as far as it can be used: None stands for what cannot."""
 
+    session: Session
+    """At the rate of the solve."""
     rig: Rig | None
     landmarks: LandmarkSet | None
     clocks: Clocks
@@ -174,11 +176,13 @@ def open_inputs(
         findings += sensor_notes(subject, imus[subject.name])
     seen = tuple(track for track in keypoints if track is not None)
     worn = [track for some in imus.values() for track in some if track is not None]
+    session = _at_sensors_rate(session, worn)
     whole = len(seen) == len(session.cameras) and len(worn) == sum(map(len, imus.values()))
     times_s = None
     if whole and (seen or worn):
         times_s = attempt(session.path.name, lambda: solve_times_s(session, seen, worn))
     return OpenedInputs(
+        session=session,
         rig=rig,
         landmarks=landmarks,
         clocks=clocks,
@@ -214,7 +218,7 @@ def open_session(session: Session, progress: Progress | None = None) -> SessionD
                 )
             )
     return SessionData(
-        session=session,
+        session=inputs.session,
         rig=inputs.rig,
         landmarks=inputs.landmarks,
         keypoints=tuple(track for track in inputs.keypoints if track is not None),
@@ -223,6 +227,15 @@ def open_session(session: Session, progress: Progress | None = None) -> SessionD
         findings=tuple(inputs.findings),
         content_hash=content_hash(session),
     )
+
+
+def _at_sensors_rate(session: Session, worn: Sequence[ImuTrack]) -> Session:
+    """Without cameras and a stated rate, people are solved as often as sensors measure."""
+    rates_hz = [track.rate_hz for track in worn if np.isfinite(track.rate_hz)]
+    if session.cameras or "rate_hz" in session.settings.model_fields_set or not rates_hz:
+        return session
+    settings = session.settings.model_copy(update={"rate_hz": float(np.median(rates_hz))})
+    return session.model_copy(update={"settings": settings})
 
 
 def _refuse(where: str, error: FusecapError) -> None:
