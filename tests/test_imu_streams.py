@@ -10,13 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from fusecap.believable import MOST_PEOPLE, surest
 from fusecap.body.landmarks import landmark_set_named
 from fusecap.errors import InputError
-from fusecap.live.devices.openpose_folder import MAX_PEOPLE, believable
+from fusecap.inputs import KEYPOINTS
 from fusecap.sources.imu_streams.lsl import sensor_channels
 from fusecap.sources.imu_streams.mvn import mvn_packet
 from fusecap.sources.imu_streams.osc import osc_packet
-from fusecap.sources.keypoint_files import MAX_FILE_BYTES, read_people
+from fusecap.sources.keypoint_files import read_people
 from fusecap.sources.live_sensor import MAX_DATAGRAM_BYTES, Packet, Refused
 from fusecap.sources.synchronizer import world_from_imu_world
 from fusecap.types import ImuSample
@@ -328,7 +329,7 @@ def test_keypoint_file_of_50_megabytes_is_refused_by_its_size(tmp_path):
     tracemalloc.start()
     try:
         assert read_people(path, COCO) is None
-        assert tracemalloc.get_traced_memory()[1] < MAX_FILE_BYTES
+        assert tracemalloc.get_traced_memory()[1] < (KEYPOINTS.most_bytes or 0)
     finally:
         tracemalloc.stop()
 
@@ -340,7 +341,7 @@ def test_numbers_that_are_no_pixels_count_as_missing(tmp_path):
     path.write_text(json.dumps({"people": [{"pose_keypoints_2d": wild}]}))
     read = read_people(path, COCO)
     assert read is not None
-    people = believable(read)
+    people = surest(read)
     assert people.shape == (1, 17, 3) and (people[0, :3, 2] == 0).all()
     assert np.isnan(people[0, :3, :2]).all() and (people[0, 3:, 2] == 0.5).all()
 
@@ -348,8 +349,8 @@ def test_numbers_that_are_no_pixels_count_as_missing(tmp_path):
 def test_of_a_crowd_the_surest_are_kept():
     crowd = np.tile(np.array(PERSON).reshape(1, 17, 3), (500, 1, 1))
     crowd[100, :, 2] = 0.9
-    people = believable(crowd)
-    assert people.shape == (MAX_PEOPLE, 17, 3) and (people[:, 0, 2] == 0.9).sum() == 1
+    people = surest(crowd)
+    assert people.shape == (MOST_PEOPLE, 17, 3) and (people[:, 0, 2] == 0.9).sum() == 1
 
 
 @given(

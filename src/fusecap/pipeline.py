@@ -22,6 +22,7 @@ from jaxtyping import Float
 from fusecap.associate.paper import PaperSorter
 from fusecap.associate.subjects import Subject
 from fusecap.associate.tracker import Tracker
+from fusecap.believable import believable_detections, believable_reading, checked_moment
 from fusecap.errors import SessionError
 from fusecap.geometry.camera import Camera
 from fusecap.setup import Setup
@@ -129,6 +130,7 @@ class Pipeline:
         self._pool = pool
         self._estimators: dict[str, Estimator] = {}
         self._removed: set[str] = set()
+        self._now_ns: int | None = None
         self._looked_ns: int | None = None
         """When a camera last looked, at the latest at the first instant."""
         nobody = np.empty((0, len(setup.landmarks.landmark_names), 3))
@@ -136,7 +138,20 @@ class Pipeline:
         self._step = Step(updates=(), estimates=())
 
     def step(self, detections: Detections, readings: Mapping[str, ImuReading]) -> Step:
-        """One instant: `readings` holds, by subject name, what its sensors say."""
+        """One instant: `readings` holds, by subject name, what its sensors say.
+
+        Raises `InputError` for arrays of another shape, crowds, and a time that is not after the
+        last one's, with everything as it was before.
+        """
+        landmarks = len(self._setup.landmarks.landmark_names)
+        checked_moment(detections.timestamp_ns, self._now_ns)
+        detections = believable_detections(detections, len(self._setup.rig), landmarks)
+        readings = {
+            name: believable_reading(reading, len(self.model(name).sites.bone))
+            for name, reading in readings.items()
+            if name in self._models
+        }
+        self._now_ns = detections.timestamp_ns
         updates = self._sort(detections, readings)
         followed = [update for update in updates if update.state is not TrackState.TENTATIVE]
         work = []
@@ -144,7 +159,7 @@ class Pipeline:
             observation = observation_of(
                 update,
                 detections,
-                len(self._setup.landmarks.landmark_names),
+                landmarks,
                 readings.get(update.name),
             )
             work.append((self._estimator(update.name), update, observation))

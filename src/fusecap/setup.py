@@ -44,6 +44,8 @@ class Setup:
     tracker: TrackerOptions = field(default_factory=TrackerOptions)
 
     def __post_init__(self) -> None:
+        if not 0 < self.rate_hz <= 1e6:
+            raise SessionError(f"rate_hz is {self.rate_hz}; expected a number of Hz")
         if self.associate not in ("tracker", "paper"):
             raise SessionError(f"associate = {self.associate!r}; expected 'tracker' or 'paper'")
         if self.associate == "paper" and len(self.rig) == 1:

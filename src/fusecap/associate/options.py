@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 from fusecap.associate.candidates import CandidateOptions
 from fusecap.errors import SessionError
@@ -57,6 +57,10 @@ class TrackerOptions:
     candidates: CandidateOptions = field(default_factory=CandidateOptions)
 
     def __post_init__(self) -> None:
+        for option in fields(self):
+            value = getattr(self, option.name)
+            if isinstance(value, int | float) and not 0 <= value <= 1e9:
+                raise SessionError(f"{option.name} is {value}; expected a number from 0 on")
         if self.max_subjects is not None and self.max_subjects < 1:
             raise SessionError(f"max_subjects is {self.max_subjects}; expected 1 or more")
         if self.volume_m is not None:

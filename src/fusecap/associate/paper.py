@@ -32,6 +32,7 @@ from fusecap.associate.anatomy import Anatomy
 from fusecap.associate.candidates import triangulate_pairs
 from fusecap.associate.subjects import Subject, check_distinct
 from fusecap.associate.views import Views
+from fusecap.believable import believable_detections
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.errors import SessionError
 from fusecap.geometry.camera import REFERENCE_WIDTH_PX, Rig
@@ -103,6 +104,7 @@ class PaperSorter:
         self._rig = rig
         self._options = options or PaperSorterOptions()
         self._anatomy = Anatomy(landmark_set)
+        self._landmarks = len(landmark_set.landmark_names)
         self._subjects = list(subjects)
         self._last: list[np.ndarray | None] = [None] * len(subjects)
 
@@ -117,6 +119,7 @@ class PaperSorter:
         `predicted` and `now_ns` are there for the tracker's sake: Algorithm 1 knows only the last
         viewed locations.
         """
+        detections = believable_detections(detections, len(self._rig), self._landmarks)
         views = Views.of(self._rig, detections)
         candidates = self._gather(views)
         means = [candidate.mean() for candidate in candidates]

@@ -36,6 +36,7 @@ from fusecap.associate.population import Population
 from fusecap.associate.subjects import Cast, Subject
 from fusecap.associate.track import Track, absorb, measure
 from fusecap.associate.views import MIN_COMMON, Views
+from fusecap.believable import believable_detections, believable_points, checked_moment
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.geometry.camera import Rig
 from fusecap.types import Detections, TrackState, TrackUpdate
@@ -54,6 +55,7 @@ class Tracker:
         self._rig = rig
         self._options = options or TrackerOptions()
         self._anatomy = Anatomy(landmark_set)
+        self._landmarks = len(landmark_set.landmark_names)
         self._cast = Cast(subjects, rig, self._anatomy, self._options)
         self._population = Population(self._options, self._anatomy, landmark_set.mirror)
         self._matcher = Matcher(self._options, landmark_set.mirror)
@@ -72,8 +74,12 @@ class Tracker:
 
         `predicted` holds, by track id, the landmarks [m] that the last solve expects now; NaN rows
         and absent tracks are predicted here. Subjects come first in the result, in their order,
-        then newcomers under trial, without a name.
+        then newcomers under trial, without a name. Raises `InputError` for arrays of another
+        shape, crowds, and a time that is not after the last one, with everything as it was.
         """
+        detections = believable_detections(detections, len(self._rig), self._landmarks)
+        predicted = {k: believable_points(some, self._landmarks) for k, some in predicted.items()}
+        now_ns = checked_moment(now_ns, self._last_ns)
         views = Views.of(self._rig, detections)
         self._looking = np.array(detections.looked or (True,) * len(self._rig))
         tracks = self._population.tracks

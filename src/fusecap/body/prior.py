@@ -27,6 +27,8 @@ from fusecap.inputs import PRIOR, read_npz
 
 _ARRAYS = ("mean", "basis", "sigma", "acceleration")
 _ORTHONORMAL_TOLERANCE = 1e-5
+_MOST = 1e6
+"""Of any number."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +57,7 @@ class PosePrior:
                 f"pose prior of '{self.skeleton_name}': mean, basis and sigma have shapes {shapes};"
                 f" expected ({size},), ({size}, r), (r,)"
             )
-        if not all(np.all(np.isfinite(getattr(self, name))) for name in _ARRAYS):
+        if not all((np.abs(getattr(self, name)) <= _MOST).all() for name in _ARRAYS):
             raise MotionError(f"pose prior of '{self.skeleton_name}': a value is not a number")
         if self.acceleration.shape != (2 + size // 3,) or np.any(self.acceleration <= 0):
             raise MotionError(

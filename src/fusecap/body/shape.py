@@ -27,6 +27,8 @@ from fusecap.errors import InputError, nearest
 
 REFERENCE_HEIGHT_M = 1.75
 MIN_HEIGHT_M, MAX_HEIGHT_M = 0.6, 2.6
+MAX_OFFSET_M = 10.0
+"""Between neighbouring joints, and of a stature."""
 
 _HIP_HEIGHT = 0.530
 _KNEE_HEIGHT = 0.285
@@ -88,8 +90,10 @@ class BodyShape:
             raise InputError(
                 f"body shape: {self.offsets_m.shape} offsets for {self.skeleton.bone_count} bones"
             )
-        if not np.all(np.isfinite(self.offsets_m)):
-            raise InputError("body shape: an offset is not a number")
+        if not (np.abs(self.offsets_m) <= MAX_OFFSET_M).all():
+            raise InputError(f"body shape: an offset is not a number of at most {MAX_OFFSET_M} m")
+        if not 0.0 < self.height_m <= MAX_OFFSET_M:
+            raise InputError(f"body shape: the stature is {self.height_m} m")
 
     @classmethod
     def from_height(cls, skeleton: Skeleton, height_m: float) -> BodyShape:

@@ -30,7 +30,7 @@ class Skeleton:
     parents: tuple[int, ...]
 
     def __post_init__(self) -> None:
-        if len(self.bone_names) != len(self.parents) or self.parents[0] != -1:
+        if len(self.bone_names) != len(self.parents) or self.parents[:1] != (-1,):
             raise MotionError(f"skeleton '{self.name}': one parent per bone, the root first")
         for bone, parent in enumerate(self.parents[1:], start=1):
             if not 0 <= parent < bone:

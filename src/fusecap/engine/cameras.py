@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from fusecap.believable import believable_keypoints
 from fusecap.engine.samples import Samples
 from fusecap.sources.synchronizer import EXACT_S, Frame, people_amid
 from fusecap.types import CameraSample, Detections
@@ -15,8 +16,6 @@ LOOKING_S, LOOKING_PERIODS = 0.5, 3.0
 """A camera looks while its newest sample is not older than both: a few lost frames are no outage,
 and half a second without a picture says nothing about who is there."""
 _EXACT_NS = round(EXACT_S * 1e9)
-_MAX_PX = 1e6
-"""Farther out nothing is imaged."""
 
 People = Float[np.ndarray, "n k 3"]
 
@@ -36,7 +35,7 @@ class Cameras:
         known = 0 <= sample.camera < len(self._samples)
         if not known or people.ndim != 3 or people.shape[1:] != self._nobody.shape[1:]:
             return
-        self._samples[sample.camera].insert(sample.timestamp_ns, _sound(people))
+        self._samples[sample.camera].insert(sample.timestamp_ns, believable_keypoints(people))
 
     def detections(self, now_ns: int) -> Detections:
         """Everyone at an instant, and which cameras looked."""
@@ -78,13 +77,3 @@ def _frame(samples: Samples[People], index: int, now_ns: int) -> Frame | None:
         return None
     timestamp_ns, people = samples.at(index)
     return (timestamp_ns - now_ns) * 1e-9, people
-
-
-def _sound(people: People) -> People:
-    """Keypoints without a place, or with an impossible confidence, are missing."""
-    x, y, confidence = people[..., 0], people[..., 1], people[..., 2]
-    seen = (np.abs(x) < _MAX_PX) & (np.abs(y) < _MAX_PX) & (confidence > 0) & (confidence <= 1)
-    missing = np.isnan(x) & np.isnan(y) & (confidence == 0)
-    if (seen | missing).all():
-        return people
-    return np.where(seen[..., None], people, [np.nan, np.nan, 0.0])

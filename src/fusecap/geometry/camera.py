@@ -24,6 +24,8 @@ from fusecap.errors import CalibrationError, nearest
 REFERENCE_WIDTH_PX = 1920.0
 """Residuals are scaled to an image this wide, so that weights do not depend on resolution."""
 
+MOST, MOST_PX = 1e9, 1_000_000
+"""Of any number of a camera, and of the sides of its picture."""
 PACKED_SIZE = 24
 """Length of `Camera.packed`: R (9), t (3), fx fy cx cy, k1 k2 p1 p2 k3, scale, r²max, 0."""
 
@@ -45,9 +47,14 @@ class Camera:
 
     def __post_init__(self) -> None:
         for field in ("matrix", "distortion", "rotation", "translation"):
-            if not np.all(np.isfinite(getattr(self, field))):
+            values = np.abs(getattr(self, field))
+            if not np.all(np.isfinite(values)):
                 raise CalibrationError(f"camera '{self.name}': {field} is not a number")
-        if self.size_px[0] < 2 or self.size_px[1] < 2:
+            if values.max() > MOST:
+                raise CalibrationError(
+                    f"camera '{self.name}': {field} has {values.max():g}, expected at most {MOST:g}"
+                )
+        if not all(2 <= side <= MOST_PX for side in self.size_px):
             raise CalibrationError(f"camera '{self.name}': image size is {self.size_px}")
         if self.matrix[0, 0] <= 0 or self.matrix[1, 1] <= 0:
             raise CalibrationError(
@@ -75,7 +82,7 @@ class Camera:
     @cached_property
     def max_radius_squared(self) -> float:
         """r² up to which distortion is one-to-one; infinite without distortion."""
-        k1, k2, _, _, k3 = self.distortion
+        k1, k2, _, _, k3 = np.where(np.abs(self.distortion) < 1e-12, 0.0, self.distortion)
         roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
         folds = [r.real for r in roots if abs(r.imag) < 1e-12 and r.real > 0]
         return float(min(folds)) if folds else np.inf

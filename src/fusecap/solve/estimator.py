@@ -17,11 +17,20 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
+from fusecap.believable import (
+    MAX_M,
+    believable_keypoints,
+    believable_points,
+    believable_reading,
+    checked_moment,
+    shaped_numbers,
+)
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.body.pose import landmarks_in_world
 from fusecap.body.prior import PosePrior
 from fusecap.body.shape import BodyShape
 from fusecap.body.skeleton import PAPER21, Skeleton
+from fusecap.errors import InputError
 from fusecap.geometry.camera import Rig
 from fusecap.kernels.lie import wrap_pose
 from fusecap.solve.body_measure import BodyMeasure
@@ -61,6 +70,12 @@ class SubjectModel:
     sites: ImuSites = field(default_factory=ImuSites.none)
     start_m: tuple[float, float] | None = None
     """x, z."""
+
+    def __post_init__(self) -> None:
+        if self.start_m is not None:
+            x_m, z_m = self.start_m
+            if not (abs(x_m) <= MAX_M and abs(z_m) <= MAX_M):
+                raise InputError(f"start_m of '{self.name}' is {self.start_m}, expected x, z in m")
 
 
 class Estimator:
@@ -112,7 +127,7 @@ class Estimator:
         self._previous: Observation | None = None
         self._sites: list[np.ndarray] = []
         self._points: list[tuple[int, np.ndarray]] = []
-        self._last_start_ns = self._last_ns = -(10**18)
+        self._last_start_ns = self._last_ns = -(1 << 62)
 
     @property
     def shape(self) -> BodyShape:
@@ -126,8 +141,8 @@ class Estimator:
         landmarks_in_world_m: Float[np.ndarray, "k 3"] | None = None,
     ) -> Estimate | None:
         """`update` for a track; one that was away for a second starts from a fresh first pose."""
+        away_ns = checked_moment(observation.timestamp_ns, self._last_ns) - self._last_ns
         self.track_id = track_id
-        away_ns = observation.timestamp_ns - self._last_ns
         if self._solution is not None and away_ns > _RESTART_AFTER_NS:
             self._solution = None
             self._previous = None
@@ -164,11 +179,15 @@ class Estimator:
 
         `landmarks_in_world_m` (NaN = missing) are triangulated landmarks of this instant: they
         measure the body, place the first pose, and offer a second start when a solve ends badly.
-        With neither keypoints nor IMUs the pose is held and its error bars grow.
+        With neither keypoints nor IMUs the pose is held and its error bars grow. Raises
+        `InputError` for arrays of another shape and for a time that is not after the last one,
+        with everything as it was before.
         """
-        self._last_ns = observation.timestamp_ns
         if landmarks_in_world_m is None:
             landmarks_in_world_m = np.full((len(self._landmark_bones), 3), np.nan)
+        landmarks_in_world_m = believable_points(landmarks_in_world_m, len(self._landmark_bones))
+        observation = self._believed(observation)
+        self._last_ns = observation.timestamp_ns
         self._learn_shape(landmarks_in_world_m)
         data = self._measurements(observation)
         views = np.asarray(np.any(observation.keypoints[:, :, 2] > 0, axis=1))
@@ -202,6 +221,16 @@ class Estimator:
         if sound:
             self._recent.append(estimate)
         return estimate
+
+    def _believed(self, observation: Observation) -> Observation:
+        imu, shape = observation.imu, (*self.solver.view_shape, 3)
+        return Observation(
+            timestamp_ns=checked_moment(observation.timestamp_ns, self._last_ns),
+            keypoints=believable_keypoints(
+                shaped_numbers(observation.keypoints, shape, "keypoints")
+            ),
+            imu=None if imu is None else believable_reading(imu, len(self.model.sites.bone)),
+        )
 
     def settled(self, lag_s: float) -> Estimate | None:
         """The newest instant at least `lag_s` old, corrected by what was measured since.
@@ -309,6 +338,7 @@ class Estimator:
             starts = poses_from_one_view(shape, prior, self._rig, observation.keypoints)
         solutions = [self.solver.solve(start, self._weighed(data, start)) for start in starts]
         self._last_start_ns = observation.timestamp_ns
+        solutions = [s for s in solutions if np.isfinite(s.theta).all() and s.cost < np.inf]
         return min(solutions, key=lambda s: s.cost) if solutions else None
 
     def _better_start(

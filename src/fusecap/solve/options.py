@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, fields, replace
 
 from fusecap.errors import InputError, nearest
 
 BETWEEN = ("motion", "increment", "specific_force", "rest")
 """Terms that couple instants."""
+MOST_WEIGHT = 1e9
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,8 +54,11 @@ class Weights:
     def __post_init__(self) -> None:
         for term in fields(self):
             value = getattr(self, term.name)
-            if not (math.isfinite(value) and value >= 0):
-                raise InputError(f"weight '{term.name}' is {value}; expected a number >= 0")
+            if not 0 <= value <= MOST_WEIGHT:
+                raise InputError(
+                    f"weight '{term.name}' is {value}; expected a number >= 0, at most "
+                    f"{MOST_WEIGHT:g}"
+                )
 
     @classmethod
     def named(cls, **weights: float) -> Weights:
@@ -101,12 +104,16 @@ class SolverOptions:
     """Distance kept between the floor and the ankle and toe joints [1, eq. 16]."""
 
     def __post_init__(self) -> None:
-        if self.max_iterations < 1:
-            raise InputError(f"max_iterations is {self.max_iterations}; expected at least 1")
+        if not 1 <= self.max_iterations <= 10_000:
+            raise InputError(f"max_iterations is {self.max_iterations}; expected 1-10000")
         if not (self.window == 1 or 3 <= self.window <= 1000):
             raise InputError(f"window is {self.window}; expected 3-1000 instants, or 1")
         if not 0 < self.function_tolerance < 1:
             raise InputError(f"function_tolerance is {self.function_tolerance}; expected 0-1")
+        if not 0 < self.initial_damping <= MOST_WEIGHT:
+            raise InputError(f"initial_damping is {self.initial_damping}; expected more than 0")
+        if not 0 <= self.floor_radius_m <= 1:
+            raise InputError(f"floor_radius_m is {self.floor_radius_m}; expected 0-1 m")
 
     @property
     def together(self) -> bool:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from fusecap.believable import shaped_numbers
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.body.prior import PosePrior
 from fusecap.body.shape import BodyShape
@@ -31,6 +32,10 @@ class ImuSites:
     bone: tuple[int, ...]
     position_m: Float[np.ndarray, "i 3"]
     """t_ib in the bones' frames; used by the acceleration term only."""
+
+    def __post_init__(self) -> None:
+        if not (np.abs(shaped_numbers(self.position_m, (len(self.bone), 3), "sites")) <= 10).all():
+            raise InputError("sites of sensors lie within 10 m of their bones' joints")
 
     @classmethod
     def none(cls) -> ImuSites:
@@ -86,6 +91,11 @@ class PoseSolver:
             raise InputError(
                 f"the prior '{prior.skeleton_name}' has {prior.mean.size} numbers; "
                 f"'{skeleton.name}' needs {3 * skeleton.bone_count - 3}"
+            )
+        worn = (sites or ImuSites.none()).bone
+        if not all(0 <= bone < skeleton.bone_count for bone in worn):
+            raise InputError(
+                f"sensors on bones {worn}; '{skeleton.name}' has {skeleton.bone_count}"
             )
         self.skeleton = skeleton
         self.landmarks = landmarks

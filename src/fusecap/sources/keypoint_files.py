@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from fusecap.believable import surest
 from fusecap.body.landmarks import LANDMARK_SETS, LandmarkSet
 from fusecap.errors import InputError
 from fusecap.inputs import KEYPOINTS, read_bytes
@@ -169,14 +170,15 @@ def _read_frame(path: str, landmarks: LandmarkSet) -> np.ndarray:
 
 
 def without_missing(people: np.ndarray) -> np.ndarray:
-    """(n, K, 3) with missing keypoints as NaN, NaN, 0; people without any keypoint are left out."""
-    if len(people) == 0:
-        return people
-    seen = np.all(np.isfinite(people), axis=2) & (people[:, :, 2] > 0)
-    seen &= np.any(people[:, :, :2] != 0, axis=2)
+    """(n, K, 3) with missing keypoints as NaN, NaN, 0; people without any keypoint are left out.
+
+    Of a crowd the surest are kept, see `fusecap.believable`.
+    """
+    confidence = people[:, :, 2]
+    seen = np.any(people[:, :, :2] != 0, axis=2) & np.isfinite(confidence)
     people = np.where(seen[:, :, None], people, [np.nan, np.nan, 0.0])
     people[:, :, 2] = np.minimum(people[:, :, 2], 1.0)
-    return people[seen.any(axis=1)]
+    return surest(people)
 
 
 def _wrong_count(path: str, landmarks: LandmarkSet, values: list[Any]) -> InputError:

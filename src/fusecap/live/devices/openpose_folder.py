@@ -5,8 +5,7 @@ from __future__ import annotations
 import threading
 from pathlib import Path
 
-import numpy as np
-
+from fusecap.believable import surest
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.errors import InputError
 from fusecap.live.devices.clock_map import ClockMap
@@ -15,10 +14,6 @@ from fusecap.sources.openpose_live import LiveFrame, OpenPoseFolder
 from fusecap.types import CameraSample
 
 POLL_S = 0.004
-MAX_PEOPLE = 64
-"""In one picture; of more the surest are kept."""
-MAX_PX = 1e5
-"""A keypoint further out than this is taken as missing."""
 
 
 class OpenPoseSource:
@@ -85,18 +80,7 @@ class OpenPoseSource:
             CameraSample(
                 camera=self._camera,
                 timestamp_ns=time_ns + self._offset_ns,
-                people=believable(frame.people),
+                people=surest(frame.people),
             )
         )
         return True
-
-
-def believable(people: np.ndarray) -> np.ndarray:
-    """(n, k, 3) without keypoints that are nowhere near a picture, and without crowds."""
-    near = np.all(np.abs(people[:, :, :2]) <= MAX_PX, axis=2)
-    people = np.where(near[:, :, None], people, [np.nan, np.nan, 0.0])
-    people = people[near.any(axis=1)]
-    if len(people) > MAX_PEOPLE:
-        surest = np.argsort(-people[:, :, 2].sum(axis=1), kind="stable")[:MAX_PEOPLE]
-        people = people[np.sort(surest)]
-    return people
