@@ -16,8 +16,9 @@ from fusecap.body.skeleton import EXTENDED23, PAPER21
 from fusecap.cli import app
 from fusecap.cli.common import Exports, write_take
 from fusecap.errors import InputError, TakeError
+from fusecap.exports.euler import euler_rad
 from fusecap.exports.formats import FORMATS
-from fusecap.exports.formats.bvh import _ORDERS, euler_rad, write_bvh
+from fusecap.exports.formats.bvh import _ORDERS, write_bvh
 from fusecap.exports.rigs import PRESETS
 from fusecap.exports.take_files import export, export_take
 from fusecap.exports.take_format import ExportOptions, TakeFormat

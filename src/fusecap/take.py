@@ -166,6 +166,24 @@ class Take:
             },
         )
 
+    def of_frames(self, first: int, end: int) -> Take:
+        """The same take from frame `first` up to, and without, frame `end`."""
+        return replace(
+            self,
+            timestamps_ns=self.timestamps_ns[first:end],
+            **{
+                name: getattr(self, name)[:, first:end]
+                for name in (
+                    "theta",
+                    "bone_position_in_world_m",
+                    "bone_rotation_in_world_wxyz",
+                    "tracked",
+                    "bone_sigma_deg",
+                    "position_sigma_m",
+                )
+            },
+        )
+
     def shape(self, subject: int) -> BodyShape:
         """The body of one subject."""
         return BodyShape(

@@ -28,6 +28,10 @@ class RestRig:
     tip_m: Float[np.ndarray, "j 3"]
     """Where each joint's bone ends."""
 
+    def rest_of(self, bone: str) -> Float[np.ndarray, "3 3"]:
+        """Of one of our bones, in the world."""
+        return self.bone_rest[EXTENDED23.bone(bone)]
+
     @property
     def names(self) -> tuple[str, ...]:
         """Of the joints."""

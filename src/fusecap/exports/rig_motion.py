@@ -13,7 +13,7 @@ from fusecap.body.shape import bones_of_extended, shape_with_clavicles
 from fusecap.body.skeleton import EXTENDED23
 from fusecap.errors import TakeError
 from fusecap.exports.rest_rig import RestRig, rest_rig
-from fusecap.exports.rigs import RigPreset
+from fusecap.exports.rigs import RigPreset, rig_preset
 from fusecap.geometry.quaternions import from_wxyz
 from fusecap.take import Take
 
@@ -60,6 +60,15 @@ def held_frames(take: Take, subject: int) -> Int[np.ndarray, " t"]:
         raise TakeError(f"'{take.subject_names[subject]}' is tracked in no frame: nothing to write")
     latest = np.maximum.accumulate(np.where(tracked, np.arange(len(tracked)), -1))
     return np.where(latest < 0, np.argmax(tracked), latest)
+
+
+def rig_motions(take: Take, rig: str) -> list[RigMotion]:
+    """Everybody who is tracked at all; raises `TakeError` where nobody is."""
+    preset = rig_preset(rig)
+    people = [row for row in range(len(take.subject_names)) if take.tracked[row].any()]
+    if not people:
+        raise TakeError("nobody is tracked in any frame of the take: there is nothing to write")
+    return [rig_motion(take, row, preset) for row in people]
 
 
 def rig_motion(take: Take, subject: int, preset: RigPreset) -> RigMotion:

@@ -45,12 +45,12 @@ def export(
     format, chosen = _checked(name, unit, rig, options)
     people = _people(take)
     if not format.per_person or len(people) == 1:
-        format.write(take.of_subjects(people) if format.per_person else take, path, chosen)
-        return [path]
-    return [
-        _written(format, one, path.with_name(f"{path.stem}_{safe}{path.suffix}"), chosen)
-        for one, safe in _one_by_one(take, people)
-    ]
+        one = take.of_subjects(people) if format.per_person else take
+        return _written(format, one, path, chosen)
+    paths: list[Path] = []
+    for one, safe in _one_by_one(take, people):
+        paths += _written(format, one, path.with_name(f"{path.stem}_{safe}{path.suffix}"), chosen)
+    return paths
 
 
 def export_take(
@@ -78,11 +78,11 @@ def export_take(
     ending += chosen.tag + chosen.suffix
     base = Path(folder) / safe_name(stem)
     if not chosen.per_person:
-        return [_written(chosen, take, base.with_name(base.name + ending), settings)]
-    return [
-        _written(chosen, one, base.with_name(f"{base.name}_{safe}{ending}"), settings)
-        for one, safe in _one_by_one(take, people)
-    ]
+        return _written(chosen, take, base.with_name(base.name + ending), settings)
+    paths: list[Path] = []
+    for one, safe in _one_by_one(take, people):
+        paths += _written(chosen, one, base.with_name(f"{base.name}_{safe}{ending}"), settings)
+    return paths
 
 
 def export_all(
@@ -191,6 +191,17 @@ def _safe_names(subjects: Sequence[str]) -> list[str]:
     return names
 
 
-def _written(format: TakeFormat, take: Take, path: Path, options: ExportOptions) -> Path:
-    format.write(take, path, options)
-    return path
+def _written(format: TakeFormat, take: Take, path: Path, options: ExportOptions) -> list[Path]:
+    """One file, or `x.part1.c3d`, `x.part2.c3d` where the format holds no more frames."""
+    frames = len(take.timestamps_ns)
+    step = format.max_frames or frames
+    if frames <= step:
+        format.write(take, path, options)
+        return [path]
+    paths: list[Path] = []
+    for first in range(0, frames, step):
+        part = take.of_frames(first, first + step)
+        if part.tracked.any():
+            paths.append(path.with_name(f"{path.stem}.part{first // step + 1}{path.suffix}"))
+            format.write(part, paths[-1], options)
+    return paths

@@ -48,5 +48,7 @@ class TakeFormat:
     """A file holds one person: each is a take with that one subject."""
     units: tuple[str, ...] = METRE
     """Of length, the usual one first."""
+    max_frames: int | None = None
+    """A longer take goes into several files."""
     has_rig: bool = False
     """Whether joints have names and a rest pose that a preset can choose."""

@@ -13,6 +13,13 @@ if TYPE_CHECKING:
 
 FORMATS = {
     "bvh": "a skeleton and its rotations, for Blender, Unity, Unreal, MotionBuilder",
+    "csv": "a tidy table of bones, for pandas, R and spreadsheets",
+    "npz": "NumPy arrays of joints on a rig",
+    "trc": "marker trajectories for OpenSim",
+    "mot": "joint angles for OpenSim",
+    "osim": "the person as an OpenSim model with markers",
+    "c3d": "points, segment rotations and steps, for biomechanics",
+    "sto": "bone orientations for OpenSense",
 }
 """What each is, by its name and that of its module."""
 

@@ -8,9 +8,8 @@ joint's CHANNELS:
 
 A middle angle of 90 degrees makes the others meaningless (gimbal lock), and jumps from frame to
 frame far beyond what the joint turned: with Z X Y that is every bent knee. No order suits all
-joints, so each has the one of the six whose middle angle stays furthest from 90 degrees in this
-file. (a, b, c) and (a + 180, 180 - b, c + 180) are one rotation: a frame has the triple, and the
-full turns, that lie nearest to the frame before.
+joints: where a middle angle passes 60 degrees in this file, the joint has the one of the six orders
+that keeps it furthest from 90.
 
 Only the root, and hips below a root that stays on the floor, have position channels: importers
 disagree whether another joint's stand in place of its offset or are added to it. A rig with three
@@ -24,6 +23,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from fusecap.exports.euler import euler_rad
 from fusecap.exports.rest_rig import RestRig
 from fusecap.exports.rig_motion import rig_motion
 from fusecap.exports.rigs import rig_preset
@@ -32,9 +32,9 @@ from fusecap.files import written_whole
 from fusecap.take import Take
 
 _ORDERS = ("ZXY", "YXZ", "ZYX", "XYZ", "YZX", "XZY")
-"""The first that is as good as any: importers know Z X Y best."""
-_AS_GOOD = 0.05
-"""In the sine of the middle angle."""
+"""The first that is safe: importers know Z X Y best."""
+_SAFE = np.sin(np.radians(60.0))
+"""Up to this middle angle no curve is steeper than twice what the joint turns."""
 
 
 def write_bvh(take: Take, path: Path, options: ExportOptions) -> None:
@@ -66,38 +66,14 @@ def write_bvh(take: Take, path: Path, options: ExportOptions) -> None:
 
 
 def best_order(rotation: Float[np.ndarray, "t 3 3"]) -> str:
-    """The order of axes whose middle angle stays furthest from 90 degrees."""
+    """The first order of axes that is safe, else that which stays furthest from 90 degrees."""
     worst = [np.abs(_sine_of_middle(rotation, order)).max() for order in _ORDERS]
-    return next(o for o, w in zip(_ORDERS, worst, strict=True) if w <= min(worst) + _AS_GOOD)
-
-
-def euler_rad(rotation: Float[np.ndarray, "t 3 3"], order: str) -> Float[np.ndarray, "t 3"]:
-    """Angles about moving axes in this order, from frame to frame as near as can be."""
-    first, middle, last = ("XYZ".index(axis) for axis in order)
-    sign = 1.0 if (middle - first) % 3 == 1 else -1.0
-    cos_b = np.hypot(rotation[:, first, first], rotation[:, first, middle])
-    b = np.arctan2(sign * rotation[:, first, last], cos_b)
-    a = np.arctan2(-sign * rotation[:, middle, last], rotation[:, last, last])
-    # Of R_first(a)ᵀ R the row `middle` holds c alone: exact also where a is arbitrary.
-    row = np.cos(a)[:, None] * rotation[:, middle] + np.sin(a)[:, None] * sign * rotation[:, last]
-    c = np.arctan2(sign * row[:, first], row[:, middle])
-    return _near(np.stack([a, b, c], axis=1))
+    enough = max(min(worst), _SAFE)
+    return next(o for o, w in zip(_ORDERS, worst, strict=True) if w <= enough)
 
 
 def _sine_of_middle(rotation: Float[np.ndarray, "t 3 3"], order: str) -> Float[np.ndarray, " t"]:
     return rotation[:, "XYZ".index(order[0]), "XYZ".index(order[2])]
-
-
-def _near(angles: Float[np.ndarray, "t 3"]) -> Float[np.ndarray, "t 3"]:
-    """Each frame's nearer triple; a triple's distance to another is that of both their others."""
-    other = np.stack([angles[:, 0] + np.pi, np.pi - angles[:, 1], angles[:, 2] + np.pi], axis=1)
-
-    def apart(to: np.ndarray) -> np.ndarray:
-        return np.abs((to[1:] - angles[:-1] + np.pi) % (2 * np.pi) - np.pi).sum(axis=1)
-
-    swaps = np.concatenate([[False], apart(other) < apart(angles)])
-    swapped = np.logical_xor.accumulate(swaps)
-    return np.unwrap(np.where(swapped[:, None], other, angles), axis=0)
 
 
 def _depth_first(parents: tuple[int, ...], joint: int = 0) -> list[int]:

@@ -1,0 +1,62 @@
+"""A tidy table: one row per frame, person and bone, for pandas, R and spreadsheets.
+
+    frame,time_s,person,bone,x_m,y_m,z_m,qw,qx,qy,qz,bone_sigma_deg,position_sigma_m
+
+The joint at the bone's root and the quaternion world_from_bone, y up; a person who is not tracked
+has no row in that frame.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+
+import numpy as np
+
+from fusecap.exports.take_format import ExportOptions, TakeFormat
+from fusecap.files import written_whole
+from fusecap.take import Take
+
+COLUMNS = (
+    *("frame", "time_s", "person", "bone", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"),
+    *("bone_sigma_deg", "position_sigma_m"),
+)
+_NUMBERS = ",%.4f,%.4f,%.4f,%.5f,%.5f,%.5f,%.5f,%.2f,%.4f"
+
+
+def write_csv(take: Take, path: Path, _: ExportOptions) -> None:
+    """Writes everybody, whole or not at all."""
+    people = len(take.subject_names)
+    rows = [
+        "".join(f"%d,%.6f{_named(name, bone)}{_NUMBERS}\n" for bone in take.bone_names)
+        for name in take.subject_names
+    ]
+    times = take.time_s.tolist()
+    with written_whole(path) as file:
+        file.write((",".join(COLUMNS) + "\n").encode())
+        for frame, time_s in enumerate(times):
+            for person in range(people):
+                if take.tracked[person, frame]:
+                    values = _values(take, person, frame, time_s)
+                    file.write((rows[person] % tuple(values)).encode())
+
+
+def _values(take: Take, person: int, frame: int, time_s: float) -> list[float]:
+    table = np.empty((len(take.bone_names), 11))
+    table[:, 0], table[:, 1] = frame, time_s
+    table[:, 2:5] = take.bone_position_in_world_m[person, frame]
+    table[:, 5:9] = take.bone_rotation_in_world_wxyz[person, frame]
+    table[:, 9] = take.bone_sigma_deg[person, frame]
+    table[:, 10] = take.position_sigma_m[person, frame]
+    return table.ravel().tolist()
+
+
+def _named(person: str, bone: str) -> str:
+    """Quoted where a name needs it, and safe from the formatting of numbers."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="").writerow([person, bone])
+    return f",{text.getvalue()}".replace("%", "%%")
+
+
+FORMAT = TakeFormat(suffix=".csv", write=write_csv, per_person=False)

@@ -1,0 +1,52 @@
+"""NumPy arrays of everybody on a rig; the take itself (docs/take.md) has our bones and error bars.
+
+    person_names (S,)  joint_names (J,)  parents (J,)  time_s (T,)  rate_hz  tracked (S, T)
+    rest_position_m (S, J, 3)  rest_rotation_xyzw (S, J, 4)    in the world, standing at the origin
+    position_m (S, T, J, 3)    rotation_xyzw (S, T, J, 4)      in the parent's frame
+
+A root's values are in the world: right-handed, y up. Frames without a person hold the last pose.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from fusecap.errors import TakeError
+from fusecap.exports.rig_motion import rig_motions
+from fusecap.exports.take_format import ExportOptions, TakeFormat
+from fusecap.files import written_whole
+from fusecap.take import Take
+
+
+def write_npz(take: Take, path: Path, options: ExportOptions) -> None:
+    """Writes everybody who is tracked, whole or not at all; never over a take."""
+    if path.exists() and zipfile.is_zipfile(path):
+        with np.load(path, allow_pickle=False) as found:
+            if "theta" in found.files:
+                raise TakeError(f"{path} is a take: export to another name")
+    motions = rig_motions(take, options.rig)
+    rest = [motion.rest for motion in motions]
+    rows = [take.subject(motion.name) for motion in motions]
+    arrays = {
+        "person_names": np.array([motion.name for motion in motions], dtype=np.str_),
+        "joint_names": np.array(rest[0].names, dtype=np.str_),
+        "parents": np.array(rest[0].parents),
+        "time_s": take.time_s,
+        "rate_hz": np.array(take.rate_hz),
+        "tracked": take.tracked[rows],
+        "rest_position_m": np.array([one.position_m for one in rest]),
+        "rest_rotation_xyzw": np.array(
+            [Rotation.from_matrix(one.rotation).as_quat() for one in rest]
+        ),
+        "position_m": np.array([motion.position_m for motion in motions], dtype=np.float32),
+        "rotation_xyzw": np.array([motion.rotation_xyzw for motion in motions], dtype=np.float32),
+    }
+    with written_whole(path) as file:
+        np.savez(file, **arrays)
+
+
+FORMAT = TakeFormat(suffix=".npz", tag=".rig", write=write_npz, per_person=False, has_rig=True)

@@ -1,0 +1,339 @@
+"""Every format, opened by the ecosystem's own reader: two people, within 1 mm and 0.1 degrees."""
+
+import json
+import os
+import subprocess
+import warnings
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
+
+import fusecap
+from export_people import NEAR_DEG, NEAR_M, degrees_apart, two_walkers, with_gap
+from fusecap.body.pose import landmarks_in_world
+from fusecap.body.skeleton import EXTENDED23, PAPER21
+from fusecap.cli import app
+from fusecap.errors import InputError, TakeError
+from fusecap.exports.foot_events import foot_events, standing
+from fusecap.exports.formats import FORMATS, format_named
+from fusecap.exports.markers import bone_markers
+from fusecap.exports.opensim import OPENSIM_FROM_OURS
+from fusecap.exports.take_files import export_all, export_take
+from fusecap.sources.imu_files.formats.sto import FORMAT as STO
+from fusecap.take import save_take
+from motions import person, take_of, walk
+
+READERS = Path(__file__).parent / "readers"
+ODD_NAMES = ('a,b/"c" 100%s', "Zoë 🙂")
+
+
+def environment(variable: str, module: str) -> str:
+    """A Python that has `module`, in an environment of its own."""
+    python = os.environ.get(variable)
+    if not python:
+        pytest.skip(f"{variable} does not name a Python with {module}")
+    return python
+
+
+def run_reader(python: str, script: str, *arguments: object) -> dict:
+    """The last line a reader prints, as JSON."""
+    run = subprocess.run(
+        [python, str(READERS / script), *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert run.returncode == 0, run.stderr
+    return json.loads(run.stdout.splitlines()[-1])
+
+
+@pytest.mark.parametrize("names", [("anna", "ben"), ODD_NAMES])
+def test_pandas_reads_the_tidy_table(tmp_path, names):
+    pandas = pytest.importorskip("pandas")
+    take = with_gap(two_walkers(names=names), [3, 4])
+    (path,) = export_take(take, tmp_path, format="csv", stem="t")
+    table = pandas.read_csv(path)
+    assert len(table) == (40 * 2 - 2) * 21
+    assert set(table["frame"][table["person"] == names[0]]) == set(range(40)) - {3, 4}
+    for row, name in enumerate(names):
+        mine = table[table["person"] == name]
+        tracked = take.tracked[row]
+        assert mine["bone"].tolist() == list(take.bone_names) * tracked.sum()
+        places = mine[["x_m", "y_m", "z_m"]].to_numpy().reshape(-1, 21, 3)
+        assert np.abs(places - take.bone_position_in_world_m[row, tracked]).max() < NEAR_M
+        turns = mine[["qw", "qx", "qy", "qz"]].to_numpy().reshape(-1, 21, 4)
+        turns /= np.linalg.norm(turns, axis=-1, keepdims=True)
+        true = take.bone_rotation_in_world_wxyz[row, tracked]
+        assert degrees_apart(turns, true) < NEAR_DEG
+        times = mine["time_s"].to_numpy().reshape(-1, 21)[:, 0]
+        assert np.abs(times - take.time_s[tracked]).max() < 1e-6
+
+
+@pytest.mark.parametrize("rig", ["native", "unity", "ue5"])
+def test_numpy_arrays_chain_to_the_take(tmp_path, rig):
+    take = two_walkers()
+    (path,) = export_take(take, tmp_path, format="npz", stem="t", rig=rig)
+    with np.load(path, allow_pickle=False) as arrays:
+        names, parents = arrays["joint_names"].tolist(), arrays["parents"].tolist()
+        head = {"native": "head", "unity": "Head", "ue5": "head"}[rig]
+        foot = {"native": "left_foot", "unity": "LeftFoot", "ue5": "foot_l"}[rig]
+        for row in range(2):
+            places, turns = chained(
+                parents,
+                arrays["position_m"][row].astype(float),
+                arrays["rotation_xyzw"][row].astype(float),
+            )
+            rest = Rotation.from_quat(arrays["rest_rotation_xyzw"][row])
+            for joint, bone in ((head, "head"), (foot, "left_foot")):
+                index, ours = names.index(joint), take.skeleton.bone(bone)
+                true = take.bone_position_in_world_m[row, :, ours]
+                assert np.abs(places[index] - true).max() < NEAR_M
+                turned = (turns[index] * rest[index].inv()).as_quat()
+                true = np.roll(take.bone_rotation_in_world_wxyz[row, :, ours], -1, axis=-1)
+                assert degrees_apart(turned, true) < NEAR_DEG
+
+
+def chained(parents, position_m, xyzw) -> tuple[list[np.ndarray], list[Rotation]]:
+    """Places and turns in the world of every joint, from those in the parents."""
+    places, turns = [], []
+    for joint, parent in enumerate(parents):
+        turn = Rotation.from_quat(xyzw[:, joint])
+        if parent < 0:
+            places.append(position_m[:, joint])
+            turns.append(turn)
+        else:
+            places.append(places[parent] + turns[parent].apply(position_m[:, joint]))
+            turns.append(turns[parent] * turn)
+    return places, turns
+
+
+def test_arrays_are_never_written_over_a_take(tmp_path):
+    take = two_walkers(2)
+    save_take(take, tmp_path / "t.npz")
+    with pytest.raises(TakeError, match=r"t.npz is a take: export to another name"):
+        fusecap.export(take, tmp_path / "t.npz")
+    assert fusecap.export(take, tmp_path / "u.npz") == [tmp_path / "u.npz"]
+    assert fusecap.export(take, tmp_path / "u.npz") == [tmp_path / "u.npz"]
+    assert fusecap.load_take(tmp_path / "t.npz").subject_names == take.subject_names
+
+
+def opensim_files(take, folder) -> list[list[Path]]:
+    """Per person the model, its markers, angles and orientations."""
+    formats = ("osim", "trc", "mot", "sto")
+    return list(
+        map(
+            list,
+            zip(*(export_take(take, folder, format=f, stem="t") for f in formats), strict=True),
+        )
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("skeleton", [PAPER21, EXTENDED23], ids=lambda s: s.name)
+def test_opensim_finds_the_angles_by_inverse_kinematics(tmp_path, skeleton):
+    python = environment("FUSECAP_OPENSIM_PYTHON", "opensim")
+    take = two_walkers(30, skeleton=skeleton, names=("anna", "Zoë 🙂"))
+    for row, files in enumerate(opensim_files(take, tmp_path)):
+        out = tmp_path / f"{row}.npz"
+        assert run_reader(python, "opensim_ik.py", *files, out)["frames"] == 30
+        with np.load(out) as found:
+            rotational = found["rotational"]
+            apart = np.abs(found["ik"] - found["mot"])
+            assert apart[:, rotational].max() < 0.2 and apart[:, ~rotational].max() < NEAR_M
+            assert np.abs(found["in_file"] - found["in_model"]).max() < NEAR_M
+            assert degrees_apart(found["turn_file"], found["turn_model"]) < NEAR_DEG
+            true = marker_places(take, row) @ OPENSIM_FROM_OURS.T
+            assert np.abs(found["in_model"] - true).max() < NEAR_M
+
+
+def marker_places(take, row) -> np.ndarray:
+    points = bone_markers(take.shape(row))
+    return landmarks_in_world(
+        take.bone_position_in_world_m[row],
+        take.bone_rotation_in_world(row),
+        np.array([take.skeleton.bone(bone) for _, bone, _ in points]),
+        np.array([at for _, _, at in points]),
+    )
+
+
+@pytest.mark.parametrize(("unit", "unit_m"), [("mm", 1e-3), ("m", 1.0)])
+def test_trc_says_its_unit_and_leaves_gaps_empty(tmp_path, unit, unit_m):
+    take = with_gap(two_walkers(6), [2])
+    anna, ben = export_take(take, tmp_path, format="trc", stem="t", unit=unit)
+    for row, path in enumerate((anna, ben)):
+        lines = path.read_text().split("\n")
+        head = dict(zip(lines[1].split("\t"), lines[2].split("\t"), strict=True))
+        assert head["Units"] == unit and head["NumFrames"] == "6" and head["DataRate"] == "60"
+        names = lines[3].split("\t")[2::3]
+        assert len(names) == int(head["NumMarkers"]) and "left_knee" in names
+        cells = [line.split("\t") for line in lines[6:-1]]
+        assert [c[0] for c in cells] == [str(n) for n in range(1, 7)]
+        empty = [not any(c[2:]) for c in cells]
+        assert empty == [row == 0 and frame == 2 for frame in range(6)]
+        values = unit_m * np.array([c[2:] for c in cells if c[2]], dtype=float)
+        true = marker_places(take, row)[take.tracked[row]] @ OPENSIM_FROM_OURS.T
+        assert np.abs(values.reshape(true.shape) - true).max() < NEAR_M
+
+
+def test_our_own_opensense_reader_takes_the_orientations_back(tmp_path):
+    take = with_gap(two_walkers(20), [7])
+    path = export_take(take, tmp_path, format="sto", stem="t")[0]
+    track = STO.read(path, "pelvis_imu", None)
+    turn = Rotation.from_matrix(OPENSIM_FROM_OURS)
+    ours = Rotation.from_quat(
+        np.roll(take.bone_rotation_in_world_wxyz[0, take.tracked[0], 0], -1, axis=-1)
+    )
+    expected = np.roll((turn * ours * turn.inv()).as_quat(), 1, axis=-1)
+    assert len(track.times_s) == 19
+    assert degrees_apart(track.orientation_wxyz, expected) < NEAR_DEG
+
+
+def test_a_bent_knee_and_a_raised_thigh_are_positive_on_both_sides(tmp_path):
+    shape = person()
+    theta = np.zeros((1, 2, 66))
+    for side in ("left", "right"):
+        theta[0, :, 3 + 3 * PAPER21.bone(f"{side}_thigh")] = -np.radians(30)
+        theta[0, :, 3 + 3 * PAPER21.bone(f"{side}_shank")] = np.radians(50)
+    (path,) = export_take(take_of(theta, [shape], names=("a",)), tmp_path, format="mot", stem="t")
+    lines = path.read_text().splitlines()
+    first = lines.index("endheader") + 1
+    values = dict(
+        zip(lines[first].split("\t"), map(float, lines[first + 1].split("\t")), strict=True)
+    )
+    for side in "lr":
+        assert values[f"hip_flexion_{side}"] == pytest.approx(30)
+        assert values[f"knee_angle_{side}"] == pytest.approx(50)
+        assert values[f"arm_add_{side}"] == pytest.approx(-90)
+
+
+@pytest.mark.parametrize("skeleton", [PAPER21, EXTENDED23], ids=lambda s: s.name)
+def test_both_c3d_readers_find_points_rotations_and_gaps(tmp_path, skeleton):
+    ezc3d, c3d = pytest.importorskip("ezc3d"), pytest.importorskip("c3d")
+    take = with_gap(two_walkers(30, skeleton=skeleton, names=ODD_NAMES), [4, 5])
+    for row, path in enumerate(export_take(take, tmp_path, format="c3d", stem="t")):
+        tracked = take.tracked[row]
+        read = ezc3d.c3d(str(path))
+        point = read["parameters"]["POINT"]
+        assert point["UNITS"]["value"] == ["mm"] and point["RATE"]["value"] == [60]
+        assert (point["X_SCREEN"]["value"], point["Y_SCREEN"]["value"]) == (["+X"], ["+Y"])
+        missing = np.isnan(read["data"]["points"][0]).T
+        assert np.array_equal(missing, np.tile(~tracked[:, None], missing.shape[1]))
+        turn = read["data"]["rotations"].transpose(3, 2, 0, 1)[tracked]
+        assert read["parameters"]["ROTATION"]["LABELS"]["value"] == list(take.bone_names)
+        true = take.bone_rotation_in_world(row)[tracked]
+        assert np.abs(turn[..., :3, :3] - true).max() < 1e-4
+        places = 1e-3 * turn[..., :3, 3]
+        assert np.abs(places - take.bone_position_in_world_m[row, tracked]).max() < NEAR_M
+        with warnings.catch_warnings(), path.open("rb") as file:
+            warnings.simplefilter("ignore", UserWarning)  # It knows no rotations.
+            reader = c3d.Reader(file)
+            frames = np.array([points for _, points, _ in reader.read_frames()])
+            labels = [label.strip() for label in reader.point_labels]
+        expected = marker_places(take, row)
+        names = [name for name, _, _ in bone_markers(take.shape(row))]
+        for index, label in enumerate(labels):
+            at = 1e-3 * frames[tracked, index, :3]
+            assert np.abs(at - expected[tracked, names.index(label)]).max() < NEAR_M
+        assert (frames[~tracked, :, 3] == -1).all()
+
+
+def test_c3d_tells_steps(tmp_path):
+    ezc3d = pytest.importorskip("ezc3d")
+    shape = person()
+    theta = np.zeros((1, 120, 66))
+    theta[:, :, 1] = shape.standing_root_height_m
+    lifted = slice(40, 80)
+    for bone, angle in (("thigh", -1.2), ("shank", 1.2)):
+        theta[0, lifted, 3 + 3 * PAPER21.bone(f"left_{bone}")] = angle
+    take = take_of(theta, [shape], names=("a",))
+    assert standing(take, 0, "right").all() and not standing(take, 0, "left")[45:75].any()
+    (path,) = export_take(take, tmp_path, format="c3d", stem="t")
+    event = ezc3d.c3d(str(path))["parameters"]["EVENT"]
+    assert event["LABELS"]["value"] == ["Foot Off", "Foot Strike"]
+    assert event["CONTEXTS"]["value"] == ["Left", "Left"]
+    times = event["TIMES"]["value"]
+    assert np.allclose(times[0], 0) and np.allclose(times[1], [40 / 60, 80 / 60], atol=0.04)
+    assert all(one.frame < other.frame for one, other in pairwise(foot_events(take, 0)))
+
+
+def test_what_a_file_cannot_hold_goes_into_several(tmp_path, monkeypatch):
+    ezc3d = pytest.importorskip("ezc3d")
+    take = two_walkers(25).of_subjects([0])
+    monkeypatch.setattr("fusecap.exports.formats.c3d.FORMAT", replaced_max(10))
+    paths = export_take(take, tmp_path, format="c3d", stem="t")
+    assert [p.name for p in paths] == [f"t_anna.part{n}.c3d" for n in (1, 2, 3)]
+    counts = [ezc3d.c3d(str(p))["data"]["points"].shape[2] for p in paths]
+    assert counts == [10, 10, 5]
+
+
+def replaced_max(frames):
+    from dataclasses import replace
+
+    return replace(format_named("c3d"), max_frames=frames)
+
+
+def test_a_library_that_is_missing_is_named_with_its_extra(tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "ezc3d", None)
+    with pytest.raises(InputError, match=r"needs ezc3d.*pip install 'fusecap\[c3d\]'"):
+        export_take(two_walkers(2), tmp_path, format="c3d", stem="t")
+    assert not list(tmp_path.iterdir())
+
+
+WITHOUT_MORE = [name for name in FORMATS if name not in ("fbx", "openpose")]
+"""Formats that need neither another program nor cameras."""
+
+
+@pytest.mark.parametrize("format", WITHOUT_MORE)
+def test_one_frame_and_odd_names_are_written(tmp_path, format):
+    take = two_walkers(1, names=ODD_NAMES)
+    paths = export_take(take, tmp_path, format=format, stem="t")
+    assert len(paths) == (2 if format_named(format).per_person else 1)
+    assert all(path.stat().st_size > 0 for path in paths)
+    assert {path.name for path in paths} == {path.name for path in tmp_path.iterdir()}
+
+
+@pytest.mark.parametrize("format", WITHOUT_MORE)
+def test_gaps_are_written_and_nobody_is_refused(tmp_path, format):
+    take = with_gap(with_gap(two_walkers(6), [0, 3]), slice(None), subject=1)
+    paths = export_take(take, tmp_path, format=format, stem="t")
+    assert len(paths) == 1 and not any(b"nan" in path.read_bytes()[:50_000] for path in paths)
+    nobody = with_gap(take, slice(None))
+    with pytest.raises(TakeError, match="nobody is tracked"):
+        export_take(nobody, tmp_path / "other", format=format, stem="t")
+    assert not (tmp_path / "other").exists()
+
+
+@pytest.mark.parametrize("format", WITHOUT_MORE)
+def test_a_folder_that_is_a_file_is_one_line(tmp_path, format):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(TakeError, match="cannot write"):
+        export_take(two_walkers(2), tmp_path / "file", format=format, stem="t")
+
+
+@pytest.mark.parametrize("format", WITHOUT_MORE)
+def test_a_hundred_people(tmp_path, format):
+    shape = person()
+    names = tuple(f"person{n}" for n in range(100))
+    take = take_of(np.stack([walk(shape, 2)] * 100), [shape] * 100, names=names)
+    paths = export_take(take, tmp_path, format=format, stem="t")
+    assert len({*paths}) == (100 if format_named(format).per_person else 1)
+
+
+def test_several_formats_at_once_and_choices_that_none_has(tmp_path):
+    take = two_walkers(3)
+    save_take(take, tmp_path / "t.npz")
+    command = ["export", str(tmp_path / "t.npz"), "--format", "bvh,csv,trc", "--unit", "cm"]
+    result = CliRunner().invoke(app, [*command, "--rig", "vrm", "--json"])
+    assert result.exit_code == 0, result.output
+    names = [Path(file).name for file in json.loads(result.output)["files"]]
+    assert names[:3] == ["t_anna.vrm.cm.bvh", "t_ben.vrm.cm.bvh", "t.csv"]
+    assert names[3:] == ["t_anna.trc", "t_ben.trc"]
+    with pytest.raises(InputError, match="csv has no rig"):
+        export_all(take, tmp_path, formats=["csv"], stem="u", rig="vrm")
+    with pytest.raises(InputError, match="csv is written in m, not in cm"):
+        export_all(take, tmp_path, formats=["csv"], stem="u", unit="cm")
