@@ -279,7 +279,7 @@ def replaced_max(frames):
 
 def test_a_library_that_is_missing_is_named_with_its_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "ezc3d", None)
-    with pytest.raises(InputError, match=r"needs ezc3d.*pip install 'fusecap\[c3d\]'"):
+    with pytest.raises(InputError, match=r"ezc3d.*pip install 'fusecap\[c3d\]'"):
         export_take(two_walkers(2), tmp_path, format="c3d", stem="t")
     assert not list(tmp_path.iterdir())
 

@@ -5,23 +5,18 @@ from __future__ import annotations
 import shutil
 import tempfile
 from collections.abc import Callable
-from importlib import import_module
 from pathlib import Path
-from types import ModuleType
 
 from fusecap.errors import InputError
 from fusecap.files import written_whole
 
 
-def needed(module: str, *, extra: str) -> ModuleType:
-    """An optional library; raises `InputError` with the command that installs it."""
-    try:
-        return import_module(module)
-    except ImportError as error:
-        raise InputError(
-            f"this format needs {module.partition('.')[0]}, which cannot be imported ({error}); "
-            f"install it with: pip install 'fusecap[{extra}]'"
-        ) from error
+def missing(error: ImportError, *, extra: str) -> InputError:
+    """What to say of an optional library that cannot be imported: the command that installs it."""
+    return InputError(
+        f"this format needs a library that cannot be imported ({error}); "
+        f"install it with: pip install 'fusecap[{extra}]'"
+    )
 
 
 def written_by_name(path: Path, write: Callable[[Path], object]) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from fusecap.exports.foot_events import foot_events
-from fusecap.exports.library import needed, written_by_name
+from fusecap.exports.library import missing, written_by_name
 from fusecap.exports.markers import marker_positions_m
 from fusecap.exports.take_format import UNITS_PER_M, ExportOptions, TakeFormat
 from fusecap.files import safe_name
@@ -25,7 +25,10 @@ _MOST = 255
 
 def write_c3d(take: Take, path: Path, options: ExportOptions) -> None:
     """Writes the one subject of `take`, whole or not at all; raises `InputError` without ezc3d."""
-    ezc3d = needed("ezc3d", extra="c3d")
+    try:
+        import ezc3d
+    except ImportError as error:
+        raise missing(error, extra="c3d") from error
     scale = UNITS_PER_M[options.unit]
     names, places = marker_positions_m(take, axes=False)
     tracked = take.tracked[0]
