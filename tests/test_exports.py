@@ -15,13 +15,19 @@ from typer.testing import CliRunner
 import fusecap
 from export_people import NEAR_DEG, NEAR_M, degrees_apart, two_walkers, with_gap
 from fusecap.body.pose import landmarks_in_world
+from fusecap.body.shape import shape_with_clavicles
 from fusecap.body.skeleton import EXTENDED23, PAPER21
 from fusecap.cli import app
 from fusecap.errors import InputError, TakeError
 from fusecap.exports.foot_events import foot_events, standing
 from fusecap.exports.formats import FORMATS, format_named
+from fusecap.exports.gltf import Gltf
+from fusecap.exports.gltf_people import add_body, add_joints
 from fusecap.exports.markers import bone_markers
 from fusecap.exports.opensim import OPENSIM_FROM_OURS
+from fusecap.exports.rest_rig import rest_rig
+from fusecap.exports.rig_motion import rig_motion
+from fusecap.exports.rigs import PRESETS
 from fusecap.exports.take_files import export_all, export_take
 from fusecap.sources.imu_files.formats.sto import FORMAT as STO
 from fusecap.take import save_take
@@ -275,6 +281,234 @@ def replaced_max(frames):
     from dataclasses import replace
 
     return replace(format_named("c3d"), max_frames=frames)
+
+
+def gltf_arrays(path):
+    """The tree of a GLB, and a function that gives the values of an accessor."""
+    pygltflib = pytest.importorskip("pygltflib")
+    tree = pygltflib.GLTF2().load(str(path))
+    blob = tree.binary_blob()
+    width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+    kinds = {5126: np.float32, 5123: np.uint16, 5125: np.uint32}
+
+    def values(index):
+        accessor = tree.accessors[index]
+        view = tree.bufferViews[accessor.bufferView]
+        count = accessor.count * width[accessor.type]
+        flat = np.frombuffer(blob, kinds[accessor.componentType], count, view.byteOffset)
+        return flat.reshape(accessor.count, -1).astype(float)
+
+    return tree, values
+
+
+def gltf_motion(path):
+    """Per person its joints' names, places (J, T, 3) and turns, as the animation plays."""
+    tree, values = gltf_arrays(path)
+    (animation,) = tree.animations
+    frames = tree.accessors[animation.samplers[0].input].count
+    parent = {child: at for at, node in enumerate(tree.nodes) for child in node.children or []}
+    place = {
+        n: np.tile(node.translation or [0, 0, 0], (frames, 1)) for n, node in enumerate(tree.nodes)
+    }
+    turn = {
+        n: np.tile(node.rotation or [0, 0, 0, 1], (frames, 1)) for n, node in enumerate(tree.nodes)
+    }
+    for channel in animation.channels:
+        moved = values(animation.samplers[channel.sampler].output)
+        (turn if channel.target.path == "rotation" else place)[channel.target.node] = moved
+    order = sorted(parent)
+    found = {}
+    for owner in (n for n, node in nodes if node.children and n not in parent):
+        mine = [n for n in order if _under(n, owner, parent)]
+        joints = {n: index for index, n in enumerate(mine)}
+        parents = [joints.get(parent[n], -1) for n in mine]
+        places, turns = chained(
+            parents,
+            np.stack([place[n] for n in mine], axis=1),
+            np.stack([turn[n] for n in mine], axis=1),
+        )
+        found[tree.nodes[owner].name] = ([tree.nodes[n].name for n in mine], places, turns)
+    return found
+
+
+def _under(node, owner, parent) -> bool:
+    while node in parent:
+        node = parent[node]
+    return node == owner
+
+
+@pytest.mark.parametrize("skeleton", [PAPER21, EXTENDED23], ids=lambda s: s.name)
+@pytest.mark.parametrize("rig", PRESETS)
+def test_a_gltf_reader_finds_every_joint(tmp_path, rig, skeleton):
+    take = with_gap(two_walkers(skeleton=skeleton, names=ODD_NAMES), [3])
+    (path,) = export_take(take, tmp_path, format="glb", stem="t", rig=rig)
+    found = gltf_motion(path)
+    assert list(found) == list(ODD_NAMES)
+    for row, (names, places, turns) in enumerate(found.values()):
+        rest = rest_rig(PRESETS[rig], shape_with_clavicles(take.shape(row)))
+        assert sorted(names) == sorted(rest.names)
+        tracked = take.tracked[row]
+        for joint in PRESETS[rig].joints:
+            bone = joint.sits_at
+            if joint.towards or bone not in take.bone_names or bone not in joint.turns_with:
+                continue
+            at = names.index(joint.name)
+            index = take.skeleton.bone(bone)
+            true = take.bone_position_in_world_m[row, tracked, index]
+            assert np.abs(places[at][tracked] - true).max() < NEAR_M
+            if len(joint.turns_with) == 1:
+                of_rest = rest.rest_of(bone).T @ rest.rotation[rest.names.index(joint.name)]
+                true = take.bone_rotation_in_world(row)[tracked, index] @ of_rest
+                apart = (turns[at][tracked].inv() * Rotation.from_matrix(true)).magnitude()
+                assert np.degrees(apart).max() < NEAR_DEG
+
+
+def test_bodies_stand_around_the_joints_and_on_the_floor(tmp_path):
+    take = two_walkers(2)
+    (path,) = export_take(take, tmp_path, format="glb", stem="t")
+    tree, values = gltf_arrays(path)
+    assert len(tree.skins) == len(tree.meshes) == 2 and len(tree.animations) == 1
+    for row, mesh in enumerate(tree.meshes):
+        (primitive,) = mesh.primitives
+        points = values(primitive.attributes.POSITION)
+        weights = values(primitive.attributes.WEIGHTS_0)
+        assert np.allclose(weights.sum(axis=1), 1)
+        height = take.heights_m[row]
+        assert points[:, 1].max() == pytest.approx(height, abs=0.03)
+        assert points[:, 1].min() == pytest.approx(0.0, abs=0.02)
+        assert np.ptp(points[:, 0]) == pytest.approx(height, rel=0.1)
+        corner = points[values(primitive.indices).astype(int).reshape(-1, 3)]
+        volume = np.einsum("fi,fi->", corner[:, 0], np.cross(corner[:, 1], corner[:, 2])) / 6
+        assert 0.03 < volume < 0.12, "faces seen from outside enclose a person's litres"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("format", ["glb", "vrma"])
+def test_the_khronos_validator_has_no_error(tmp_path, format):
+    modules = node_modules("gltf-validator")
+    path = export_take(two_walkers(), tmp_path, format=format, stem="t")[0]
+    run = subprocess.run(
+        ["node", str(READERS / "gltf_validate.mjs"), str(path)],
+        cwd=modules,
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
+    )
+    report = json.loads(run.stdout)
+    assert report["numErrors"] == report["numWarnings"] == 0, report
+
+
+def node_modules(package: str) -> Path:
+    """A folder whose node_modules has a package."""
+    folder = os.environ.get("FUSECAP_NODE_FOLDER")
+    if not folder or not (Path(folder) / "node_modules" / package).is_dir():
+        pytest.skip(f"FUSECAP_NODE_FOLDER names no folder with {package} in node_modules")
+    return Path(folder)
+
+
+@pytest.mark.slow
+def test_three_vrm_plays_a_vrma_on_an_avatar(tmp_path):
+    """An avatar of the person's own proportions: bones are where the take has them.
+
+    The spine's fold costs millimetres above it, since avatars' chests do not move in their parents.
+    """
+    modules = node_modules("@pixiv/three-vrm-animation")
+    take = two_walkers()
+    paths = export_take(take, tmp_path, format="vrma", stem="t")
+    (tmp_path / "times.json").write_text(json.dumps(take.time_s.tolist()))
+    for row, path in enumerate(paths):
+        avatar = tmp_path / f"{row}.vrm"
+        write_avatar(take.of_subjects([row]), avatar)
+        out = tmp_path / f"{row}.json"
+        subprocess.run(
+            ["node", str(READERS / "vrma_on_vrm.mjs"), avatar, path, tmp_path / "times.json", out],
+            cwd=modules,
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=120,
+        )
+        frames = json.loads(out.read_text())
+        for joint in PRESETS["vrm"].joints:
+            if joint.sits_at not in take.bone_names:
+                continue
+            bone = take.skeleton.bone(joint.sits_at)
+            found = np.array([frame[joint.name] for frame in frames])
+            apart_m = np.abs(found[:, :3] - take.bone_position_in_world_m[row, :, bone]).max()
+            legs = any(part in joint.name.lower() for part in ("hips", "leg", "foot", "toes"))
+            assert apart_m < (NEAR_M if legs else 4e-3), joint.name
+            if len(joint.turns_with) == 1:
+                true = np.roll(take.bone_rotation_in_world_wxyz[row, :, bone], -1, axis=-1)
+                assert degrees_apart(found[:, 3:], true) < NEAR_DEG
+
+
+def write_avatar(take, path) -> None:
+    """The least that is a VRM 1.0."""
+    gltf = Gltf("test")
+    motion = rig_motion(take, 0, PRESETS["vrm"])
+    nodes = add_joints(gltf, motion)
+    add_body(gltf, motion, nodes, (1.0, 1.0, 1.0))
+    bones = {name: {"node": node} for name, node in zip(motion.rest.names, nodes, strict=True)}
+    meta = {"name": "t", "authors": ["t"], "licenseUrl": "https://vrm.dev/licenses/1.0/"}
+    gltf.tree["extensionsUsed"] = ["VRMC_vrm"]
+    gltf.tree["extensions"] = {
+        "VRMC_vrm": {"specVersion": "1.0", "meta": meta, "humanoid": {"humanBones": bones}}
+    }
+    gltf.write(path)
+
+
+@pytest.mark.parametrize(("unit", "unit_m"), [("m", 1.0), ("cm", 0.01)])
+def test_usd_skel_finds_every_joint(tmp_path, unit, unit_m):
+    pytest.importorskip("pxr")
+    from pxr import Usd, UsdGeom, UsdSkel
+
+    take = two_walkers(names=("anna", "Zoë/1"))
+    (path,) = export_take(take, tmp_path, format="usd", stem="t", unit=unit)
+    stage = Usd.Stage.Open(str(path))
+    assert UsdGeom.GetStageMetersPerUnit(stage) == unit_m
+    assert UsdGeom.GetStageUpAxis(stage) == "Y" and stage.GetTimeCodesPerSecond() == 60
+    cache = UsdSkel.Cache()
+    roots = [UsdSkel.Root(prim) for prim in stage.Traverse() if prim.IsA(UsdSkel.Root)]
+    assert len(roots) == 2
+    for row, root in enumerate(roots):
+        cache.Populate(root, Usd.PrimDefaultPredicate)
+        (prim,) = (p for p in root.GetPrim().GetChildren() if p.IsA(UsdSkel.Skeleton))
+        query = cache.GetSkelQuery(UsdSkel.Skeleton(prim))
+        names = [joint.rpartition("/")[2] for joint in query.GetJointOrder()]
+        for frame in range(0, 40, 7):
+            matrices = np.array(query.ComputeJointSkelTransforms(frame))
+            for bone, name in enumerate(take.bone_names):
+                found = matrices[names.index(name)]
+                true = take.bone_position_in_world_m[row, frame, bone]
+                assert np.abs(unit_m * found[3, :3] - true).max() < NEAR_M
+                true = take.bone_rotation_in_world(row)[frame, bone]
+                assert np.abs(found[:3, :3].T - true).max() < 1e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("format", ["glb", "usd", "fbx"])
+def test_blender_puts_every_joint_of_everybody_where_the_take_has_it(tmp_path, format, monkeypatch):
+    python = environment("FUSECAP_BPY_PYTHON", "bpy")
+    monkeypatch.setenv("FUSECAP_BLENDER", python)
+    take = two_walkers(names=("anna", "Zoë"))
+    (path,) = export_take(take, tmp_path, format=format, stem="t")
+    out = tmp_path / "out.npz"
+    assert run_reader(python, "blender_scene.py", path, 40, out)["armatures"] == 2
+    with np.load(out) as found:
+        armatures = sorted(
+            (key.removeprefix("heads_") for key in found.files if key.startswith("heads_")),
+            key=lambda name: not name.startswith("anna"),
+        )
+        for row, armature in enumerate(armatures):
+            names = found[f"names_{armature}"].tolist()
+            heads, tails = found[f"heads_{armature}"], found[f"tails_{armature}"]
+            for bone, name in enumerate(take.bone_names):
+                true = take.bone_position_in_world_m[row, :, bone]
+                assert np.abs(heads[:, names.index(name)] - true).max() < NEAR_M
+            length = np.linalg.norm(tails - heads, axis=-1).min(axis=0)
+            assert length[names.index("hips")] > 0.05
+            assert length[names.index("left_pelvis")] > 0.10
 
 
 def test_a_library_that_is_missing_is_named_with_its_extra(tmp_path, monkeypatch):

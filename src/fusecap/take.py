@@ -201,6 +201,11 @@ class Take:
         return matrices
 
 
+def made_by() -> str:
+    """Fusecap and its version."""
+    return f"fusecap {metadata.version('fusecap')}"
+
+
 def provenance(
     *,
     options: Mapping[str, Any],
@@ -209,7 +214,7 @@ def provenance(
 ) -> dict[str, Any]:
     """What a take says about its making: version, session, options, units, simulated or not."""
     return {
-        "made_by": f"fusecap {metadata.version('fusecap')}",
+        "made_by": made_by(),
         "session_sha256": session_sha256,
         "options": dict(options),
         "simulated": simulated,

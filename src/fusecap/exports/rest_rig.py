@@ -32,6 +32,15 @@ class RestRig:
         """Of one of our bones, in the world."""
         return self.bone_rest[EXTENDED23.bone(bone)]
 
+    @cached_property
+    def bone_rest_positions_m(self) -> Float[np.ndarray, "b 3"]:
+        """Of our bones' joints, in the world."""
+        place = np.zeros((EXTENDED23.bone_count, 3))
+        place[0, 1] = self.shape.standing_root_height_m
+        for bone, parent in enumerate(EXTENDED23.parents[1:], start=1):
+            place[bone] = place[parent] + self.bone_rest[parent] @ self.shape.offsets_m[bone]
+        return place
+
     @property
     def names(self) -> tuple[str, ...]:
         """Of the joints."""

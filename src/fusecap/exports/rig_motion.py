@@ -99,7 +99,7 @@ def _on_joints(
     turns: list[Rotation],
 ) -> RigMotion:
     count, frames = len(rest.names), len(position)
-    bone_rest_m = _bone_rest_positions(rest)
+    bone_rest_m = rest.bone_rest_positions_m
     place_m = np.empty((frames, count, 3))
     world: list[Rotation] = []
     for index, joint in enumerate(rest.preset.joints):
@@ -132,14 +132,6 @@ def _on_joints(
         position_m=position_m,
         rotation_xyzw=xyzw,
     )
-
-
-def _bone_rest_positions(rest: RestRig) -> Float[np.ndarray, "b 3"]:
-    place = np.zeros((EXTENDED23.bone_count, 3))
-    place[0, 1] = rest.shape.standing_root_height_m
-    for bone, parent in enumerate(EXTENDED23.parents[1:], start=1):
-        place[bone] = place[parent] + rest.bone_rest[parent] @ rest.shape.offsets_m[bone]
-    return place
 
 
 def _short_way(quaternion: Float[np.ndarray, "t 4"]) -> Float[np.ndarray, "t 4"]:

@@ -13,6 +13,9 @@ if TYPE_CHECKING:
 
 FORMATS = {
     "bvh": "a skeleton and its rotations, for Blender, Unity, Unreal, MotionBuilder",
+    "glb": "everybody with a body, for viewers, Blender and engines",
+    "usd": "everybody with a body (UsdSkel), for Omniverse, Houdini, Maya",
+    "vrma": "a person's motion for any VRM avatar",
     "csv": "a tidy table of bones, for pandas, R and spreadsheets",
     "npz": "NumPy arrays of joints on a rig",
     "trc": "marker trajectories for OpenSim",

@@ -1,0 +1,29 @@
+"""GLB: everybody with a skin and a plain body each, and one animation; for viewers and engines.
+
+Metres, y up. Where a person is not tracked the body keeps its last pose.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from fusecap.exports.gltf import Gltf
+from fusecap.exports.gltf_people import COLOURS, add_animation, add_body, add_joints
+from fusecap.exports.rig_motion import rig_motions
+from fusecap.exports.take_format import ExportOptions, TakeFormat
+from fusecap.take import Take, made_by
+
+
+def write_glb(take: Take, path: Path, options: ExportOptions) -> None:
+    """Writes everybody who is tracked, whole or not at all."""
+    gltf = Gltf(made_by())
+    people = []
+    for row, motion in enumerate(rig_motions(take, options.rig)):
+        nodes = add_joints(gltf, motion)
+        add_body(gltf, motion, nodes, COLOURS[row % len(COLOURS)])
+        people.append((motion, nodes))
+    add_animation(gltf, people, "take", only_root_moves=False)
+    gltf.write(path)
+
+
+FORMAT = TakeFormat(suffix=".glb", write=write_glb, per_person=False, has_rig=True)
