@@ -307,12 +307,9 @@ def gltf_motion(path):
     (animation,) = tree.animations
     frames = tree.accessors[animation.samplers[0].input].count
     parent = {child: at for at, node in enumerate(tree.nodes) for child in node.children or []}
-    place = {
-        n: np.tile(node.translation or [0, 0, 0], (frames, 1)) for n, node in enumerate(tree.nodes)
-    }
-    turn = {
-        n: np.tile(node.rotation or [0, 0, 0, 1], (frames, 1)) for n, node in enumerate(tree.nodes)
-    }
+    nodes = list(enumerate(tree.nodes))
+    place = {n: np.tile(node.translation or [0, 0, 0], (frames, 1)) for n, node in nodes}
+    turn = {n: np.tile(node.rotation or [0, 0, 0, 1], (frames, 1)) for n, node in nodes}
     for channel in animation.channels:
         moved = values(animation.samplers[channel.sampler].output)
         (turn if channel.target.path == "rotation" else place)[channel.target.node] = moved
