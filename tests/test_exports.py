@@ -2,11 +2,13 @@
 
 import json
 import os
+import shutil
 import subprocess
 import warnings
 from itertools import pairwise
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -14,11 +16,13 @@ from typer.testing import CliRunner
 
 import fusecap
 from export_people import NEAR_DEG, NEAR_M, degrees_apart, two_walkers, with_gap
+from fusecap.body.landmarks import landmark_set_named
 from fusecap.body.pose import landmarks_in_world
 from fusecap.body.shape import shape_with_clavicles
 from fusecap.body.skeleton import EXTENDED23, PAPER21
 from fusecap.cli import app
 from fusecap.errors import InputError, TakeError
+from fusecap.evaluate.demo_scene import demo_scene
 from fusecap.exports.foot_events import foot_events, standing
 from fusecap.exports.formats import FORMATS, format_named
 from fusecap.exports.gltf import Gltf
@@ -29,6 +33,7 @@ from fusecap.exports.rest_rig import rest_rig
 from fusecap.exports.rig_motion import rig_motion
 from fusecap.exports.rigs import PRESETS
 from fusecap.exports.take_files import export_all, export_take
+from fusecap.exports.take_format import ExportOptions
 from fusecap.sources.imu_files.formats.sto import FORMAT as STO
 from fusecap.take import save_take
 from motions import person, take_of, walk
@@ -506,6 +511,75 @@ def test_blender_puts_every_joint_of_everybody_where_the_take_has_it(tmp_path, f
             length = np.linalg.norm(tails - heads, axis=-1).min(axis=0)
             assert length[names.index("hips")] > 0.05
             assert length[names.index("left_pelvis")] > 0.10
+
+
+def test_keypoints_are_what_the_cameras_see(tmp_path):
+    """Our own reader's view, and the loader of a session, which solves them again."""
+    simulation, body25 = demo_scene(0, seconds=0.2), landmark_set_named("body25")
+    take = with_gap(simulation.truth, [2])
+    options = ExportOptions(cameras=simulation.rig, landmarks=body25)
+    (folder,) = export_take(take, tmp_path, format="openpose", stem="t", options=options)
+    frames = len(take.timestamps_ns)
+    for camera in simulation.rig.cameras:
+        files = sorted((folder / camera.name).glob("*_keypoints.json"))
+        assert len(files) == frames
+        for frame, file in enumerate(files):
+            people = json.loads(file.read_text())["people"]
+            assert len(people) == take.tracked[:, frame].sum()
+        rows = np.flatnonzero(take.tracked[:, frames - 1])
+        for row, someone in zip(rows, people, strict=True):
+            found = np.array(someone["pose_keypoints_2d"]).reshape(-1, 3)
+            shape = take.shape(row)
+            places = landmarks_in_world(
+                take.bone_position_in_world_m[row, -1:],
+                take.bone_rotation_in_world(row)[-1:],
+                body25.bones(take.skeleton),
+                body25.offsets_m(shape),
+            )[0]
+            pixels = camera.project(places)
+            seen = found[:, 2] > 0
+            assert seen.any() and np.abs(found[seen, :2] - pixels[seen]).max() < 2e-3
+            outside = ((pixels < 0) | (pixels > np.array(camera.size_px) - 1)).any(axis=1)
+            assert np.array_equal(~seen, outside | np.isnan(pixels).any(axis=1))
+    again = export_take(take, tmp_path, format="openpose", stem="t", options=options)
+    assert again == [folder] and [p.name for p in tmp_path.iterdir()] == ["t.openpose"]
+    with pytest.raises(InputError, match="--session"):
+        export_take(take, tmp_path, format="openpose", stem="u")
+
+
+def test_a_browser_plays_the_page_from_the_file(tmp_path):
+    """As a person would: it opens, plays, shows both names and draws something of both colours."""
+    chromium = shutil.which("chromium") or shutil.which("google-chrome")
+    if chromium is None:
+        pytest.skip("no chromium on the PATH")
+    sync_api = pytest.importorskip("playwright.sync_api")
+    take = two_walkers(names=("anna</script>", "Zoë 🙂"))
+    (path,) = export_take(take, tmp_path, format="html", stem="t")
+    flags = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
+    troubles: list[str] = []
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium, args=flags)
+        page = browser.new_page(viewport={"width": 500, "height": 400})
+        page.on("pageerror", lambda error: troubles.append(str(error)))
+        page.on("request", lambda r: troubles.extend([r.url] if r.url[:5] != "file:" else []))
+        page.goto(path.as_uri())
+        page.wait_for_function("document.getElementById('clock').textContent > '0.2'")
+        page.click("#play")
+        page.evaluate("show(20)")
+        labels = page.locator(".label").all_inner_texts()
+        points = page.evaluate("Array.from(take.people[1].steps)")
+        page.screenshot(path=tmp_path / "page.png")
+        browser.close()
+    assert troubles == [] and labels == ["anna</script>", "Zoë 🙂"]
+    found_m = 1e-3 * np.array(points).reshape(40, -1, 3)
+    joints = PRESETS["native"].joints
+    names = [joint.name for joint in joints]
+    for bone, name in enumerate(take.bone_names):
+        true = take.bone_position_in_world_m[1, :, bone]
+        assert np.abs(found_m[:, names.index(name)] - true).max() < NEAR_M
+    picture = cv2.imread(str(tmp_path / "page.png")).astype(int)
+    blue, orange = picture[..., 0] - picture[..., 2], picture[..., 2] - picture[..., 0]
+    assert (blue > 40).sum() > 300 and (orange > 40).sum() > 300
 
 
 def test_a_library_that_is_missing_is_named_with_its_extra(tmp_path, monkeypatch):

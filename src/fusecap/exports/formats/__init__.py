@@ -15,6 +15,8 @@ FORMATS = {
     "bvh": "a skeleton and its rotations, for Blender, Unity, Unreal, MotionBuilder",
     "glb": "everybody with a body, for viewers, Blender and engines",
     "usd": "everybody with a body (UsdSkel), for Omniverse, Houdini, Maya",
+    "fbx": "everybody with a body, for Unreal, Unity, MotionBuilder, Maya; needs Blender",
+    "html": "a page that plays the take in any browser, without a server",
     "vrma": "a person's motion for any VRM avatar",
     "csv": "a tidy table of bones, for pandas, R and spreadsheets",
     "npz": "NumPy arrays of joints on a rig",
@@ -22,6 +24,7 @@ FORMATS = {
     "mot": "joint angles for OpenSim",
     "osim": "the person as an OpenSim model with markers",
     "c3d": "points, segment rotations and steps, for biomechanics",
+    "openpose": "landmarks as the session's cameras see them, OpenPose JSON",
     "sto": "bone orientations for OpenSense",
 }
 """What each is, by its name and that of its module."""

@@ -1,0 +1,133 @@
+"""A page that plays the take in any browser, from the file alone: no server, no network.
+
+Joints are whole millimetres in 16 bits, wider rooms in coarser steps; a person who is not tracked
+is not shown.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from fusecap.body.shape import REFERENCE_HEIGHT_M
+from fusecap.exports.gltf_people import COLOURS
+from fusecap.exports.rest_rig import RestRig
+from fusecap.exports.rig_motion import RigMotion, rig_motions
+from fusecap.exports.take_format import ExportOptions, TakeFormat
+from fusecap.files import write_whole
+from fusecap.take import Take
+
+_MOST, _HIDDEN = 32767, -32768
+_HEAD_M, _NOSE_M = np.array([0.0, 0.090, 0.015]), np.array([0.0, 0.070, 0.115])
+_HEAD_RADIUS_M = 0.098
+_RADII_M = {
+    "hips": 0.085,
+    "spine": 0.095,
+    "neck": 0.045,
+    "head": 0.045,
+    "pelvis": 0.075,
+    "clavicle": 0.055,
+    "upper_arm": 0.043,
+    "forearm": 0.034,
+    "hand": 0.025,
+    "thigh": 0.065,
+    "shank": 0.046,
+    "foot": 0.030,
+    "toes": 0.022,
+}
+"""Of a bone's stick, by its name without side and number, for a person of 1.75 m."""
+
+
+def write_html(take: Take, path: Path, _: ExportOptions) -> None:
+    """Writes everybody, whole or not at all."""
+    motions = rig_motions(take, "native")
+    places = [_points_m(motion) for motion in motions]
+    reach_m = max(np.abs(points).max() for points in places)
+    step_m = max(1e-3, float(reach_m) / _MOST)
+    people: list[dict[str, Any]] = []
+    for row, (motion, points) in enumerate(zip(motions, places, strict=True)):
+        steps = np.round(points / step_m).astype("<i2")
+        steps[~take.tracked[take.subject(motion.name)]] = _HIDDEN
+        people.append(
+            {
+                "name": motion.name,
+                "colour": COLOURS[row % len(COLOURS)],
+                "sticks": _sticks(motion.rest),
+                "points": points.shape[1],
+                "data": base64.b64encode(steps.tobytes()).decode(),
+            }
+        )
+    told = {
+        "title": path.stem,
+        "step_m": step_m,
+        "time_s": np.round(take.time_s, 5).tolist(),
+        "simulated": bool(take.provenance.get("simulated")),
+        "people": people,
+    }
+    # No "<" of a name may end the script that holds it.
+    data = json.dumps(told, separators=(",", ":")).replace("<", "\\u003c")
+    page = (files("fusecap.exports") / "page.html").read_text(encoding="utf-8")
+    write_whole(path, page.replace("@TAKE@", data))
+
+
+def _points_m(motion: RigMotion) -> np.ndarray:
+    """Joints, tips of leaves, the head's middle, the nose: (T, P, 3) in the world."""
+    rest = motion.rest
+    places: list[np.ndarray] = []
+    turns: list[Rotation] = []
+    for joint, parent in enumerate(rest.parents):
+        turn = Rotation.from_quat(motion.rotation_xyzw[:, joint])
+        place = motion.position_m[:, joint]
+        if parent >= 0:
+            place = places[parent] + turns[parent].apply(place)
+            turn = turns[parent] * turn
+        places.append(place)
+        turns.append(turn)
+    tips = [
+        places[leaf] + turns[leaf].apply(rest.tip_m[leaf] - rest.position_m[leaf])
+        for leaf in rest.leaves
+    ]
+    head = rest.names.index("head")
+    face = [places[head] + turns[head].apply(_size(rest) * at) for at in (_HEAD_M, _NOSE_M)]
+    return np.stack([*places, *tips, *face], axis=1)
+
+
+def _sticks(rest: RestRig) -> list[list[float]]:
+    """Start, end, radius [m] and shade: the right side is darker, so that a mirror is seen."""
+    ends = {leaf: len(rest.names) + index for index, leaf in enumerate(rest.leaves)}
+    sticks = []
+    for joint, name in enumerate(rest.names):
+        children = [child for child, parent in enumerate(rest.parents) if parent == joint]
+        shade = 0.65 if name.startswith("right_") else 1.0
+        radius = _size(rest) * _RADII_M[_kind(name)]
+        if joint in ends and name != "head":
+            sticks.append([joint, ends[joint], radius, shade])
+        for child in children:
+            between = rest.names[child]
+            side = between.startswith(("left_", "right_")) and not name.startswith(
+                ("left_", "right_")
+            )
+            thin = _size(rest) * _RADII_M[_kind(between)] if side else radius
+            sticks.append([joint, child, thin, 0.65 if between.startswith("right_") else shade])
+    head = len(rest.names) + len(rest.leaves)
+    sticks.append([rest.names.index("head"), head, _size(rest) * _RADII_M["head"], 1.0])
+    sticks.append([head, head, _size(rest) * _HEAD_RADIUS_M, 1.0])
+    sticks.append([head + 1, head + 1, _size(rest) * 0.02, 0.9])
+    return sticks
+
+
+def _kind(name: str) -> str:
+    return name.removeprefix("left_").removeprefix("right_").rstrip("0123456789")
+
+
+def _size(rest: RestRig) -> float:
+    return rest.shape.height_m / REFERENCE_HEIGHT_M
+
+
+FORMAT = TakeFormat(suffix=".html", write=write_html, per_person=False)
