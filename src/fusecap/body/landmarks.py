@@ -11,7 +11,7 @@ that was `calibrated` carries the result to whoever asks it for offsets.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -86,8 +86,23 @@ class LandmarkSet:
 
     name: str
     landmark_names: tuple[str, ...]
+    keypoints: int | None = None
+    """How many the detector gives, where these are only some; None: as many as landmarks."""
+    columns: tuple[int, ...] | None = None
+    """Which of its keypoints the landmarks are; None: the first."""
     offsets: LandmarkOffsets | None = field(default=None, hash=False)
     """Calibrated; None: the defaults of `LANDMARKS`."""
+
+    @property
+    def keypoint_count(self) -> int:
+        """Keypoints per person in a file."""
+        return self.keypoints or len(self.landmark_names)
+
+    def of_keypoints(self, people: Float[np.ndarray, "n m 3"]) -> Float[np.ndarray, "n k 3"]:
+        """Those of all a detector's keypoints that are landmarks."""
+        if self.columns is None:
+            return people[:, : len(self.landmark_names)]
+        return people[:, list(self.columns)]
 
     def index(self, name: str) -> int | None:
         """Position of a landmark, or None where this detector does not have it."""
@@ -145,14 +160,54 @@ _ORDERS = {
     "halpe26": f"{_COCO} head_top neck mid_hip left_big_toe right_big_toe left_small_toe "
     "right_small_toe left_heel right_heel",
     "coco17": _COCO,
+    "coco18": f"nose neck {_RIGHT_THEN_LEFT_ARM} right_hip right_knee right_ankle left_hip "
+    "left_knee left_ankle right_eye left_eye right_ear left_ear",
     "mpi15": f"head_top neck {_RIGHT_THEN_LEFT_ARM} right_hip right_knee right_ankle left_hip "
     "left_knee left_ankle chest",
 }
 
-LANDMARK_SETS = {
-    name: LandmarkSet(name=name, landmark_names=tuple(order.split()))
-    for name, order in _ORDERS.items()
+_HANDS_AND_FACE = {
+    "wholebody133": (
+        "coco17",
+        "left_big_toe left_small_toe left_heel right_big_toe right_small_toe right_heel",
+        133,
+    ),
+    "halpe136": ("halpe26", "", 136),
+    "body135": ("body25b", "", 135),
 }
+"""Whose first keypoints are those of another set, then some, and then ones no bone carries."""
+_BLAZEPOSE33 = {
+    "nose": 0,
+    "left_eye": 2,
+    "right_eye": 5,
+    "left_ear": 7,
+    "right_ear": 8,
+    **{
+        f"{side}_{name}": number + (side == "right")
+        for name, number in (
+            *(("shoulder", 11), ("elbow", 13), ("wrist", 15), ("hip", 23), ("knee", 25)),
+            *(("ankle", 27), ("heel", 29), ("big_toe", 31)),
+        )
+        for side in ("left", "right")
+    },
+}
+
+
+def _landmark_sets() -> Iterator[LandmarkSet]:
+    for name, order in _ORDERS.items():
+        yield LandmarkSet(name=name, landmark_names=tuple(order.split()))
+    for name, (first, then, count) in _HANDS_AND_FACE.items():
+        names = (*_ORDERS[first].split(), *then.split())
+        yield LandmarkSet(name=name, landmark_names=names, keypoints=count)
+    yield LandmarkSet(
+        name="blazepose33",
+        landmark_names=tuple(_BLAZEPOSE33),
+        keypoints=33,
+        columns=tuple(_BLAZEPOSE33.values()),
+    )
+
+
+LANDMARK_SETS = {landmarks.name: landmarks for landmarks in _landmark_sets()}
 
 
 def landmark_set_named(name: str) -> LandmarkSet:

@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from fusecap.body.landmarks import LANDMARK_SETS, LandmarkSet
 from fusecap.errors import FusecapError, InputError
-from fusecap.inputs import KEYPOINTS, read_bytes
 from fusecap.sources.calibration_files.loader import load_rig, may_be_calibration
+from fusecap.sources.calibration_files.plausibility import SAME_PLACE_M, camera_spread
 from fusecap.sources.imu_files import imu_format_of, sensor_names
+from fusecap.sources.keypoint_files import sets_in
 from fusecap.sources.sensor_bones import bone_of
 from fusecap.sources.video import VIDEO_SUFFIXES
 
 DEEPEST = 3
 """Folders below the surveyed one."""
 
+_MADE = re.compile(
+    r"[_-]?(?P<own>overlay)s?$|[_-](drawn|pose|openpose|rendered|skeleton|keypoints|labeled|annotated)$",
+    re.IGNORECASE,
+)
+"""What programs append to the name of a video that they drew into."""
+_MADE_FOLDERS = ("overlay", "overlays")
 _DECORATION = re.compile(r"[_-]?(json|keypoints|openpose|pose)$", re.IGNORECASE)
 
 
@@ -41,11 +46,15 @@ class FolderSurvey:
 
     folder: Path
     videos: tuple[Path, ...]
+    made: tuple[Path, ...]
+    """Videos that are drawings of others."""
     keypoints: dict[str, Path]
     """By camera."""
     keypoint_format: str | None
     """That of all cameras, as the number of values tells."""
     calibration: Path | None
+    """The one that places the cameras best."""
+    other_calibrations: tuple[Path, ...]
     cameras: tuple[str, ...]
     """Of the calibration."""
     sensors: tuple[FoundSensor, ...]
@@ -66,16 +75,35 @@ def survey(folder: Path) -> FolderSurvey:
         if file.suffix == ".json" and re.search(r"\d(_keypoints)?$", file.stem):
             name = _DECORATION.sub("", file.parent.name) or file.parent.name
             keypoints.setdefault(name, file.parent.relative_to(folder))
-    calibration, cameras = _calibration(folder, files)
+    calibration, others, cameras = _calibration(folder, files)
+    videos, made = _videos(folder, files)
     return FolderSurvey(
         folder=folder,
-        videos=tuple(f.relative_to(folder) for f in files if f.suffix.lower() in VIDEO_SUFFIXES),
+        videos=videos,
+        made=made,
         keypoints=keypoints,
         keypoint_format=_keypoint_format(folder, keypoints),
         calibration=calibration,
+        other_calibrations=others,
         cameras=cameras,
         sensors=tuple(sensor for file in files for sensor in _sensors(folder, file)),
     )
+
+
+def _videos(folder: Path, files: list[Path]) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
+    """Recordings, and what was made of them: overlays, pictures of a take."""
+    videos = [f.relative_to(folder) for f in files if f.suffix.lower() in VIDEO_SUFFIXES]
+    stems = {path.stem for path in videos}
+    made = [path for path in videos if _is_made(path, stems)]
+    return tuple(path for path in videos if path not in made), tuple(made)
+
+
+def _is_made(path: Path, stems: set[str]) -> bool:
+    """Whether a video's name is another's with what a drawing of it is called."""
+    if any(part in _MADE_FOLDERS for part in path.parts[:-1]):
+        return True
+    match = _MADE.search(path.stem)
+    return match is not None and (path.stem[: match.start()] in stems or bool(match["own"]))
 
 
 def _files(folder: Path, depth: int) -> Iterator[Path]:
@@ -90,34 +118,42 @@ def _files(folder: Path, depth: int) -> Iterator[Path]:
             yield from _files(Path(entry.path), depth - 1)
 
 
-def _calibration(folder: Path, files: list[Path]) -> tuple[Path | None, tuple[str, ...]]:
-    """The first file that reads as a calibration, the least deep one first."""
-    candidates = [file for file in files if may_be_calibration(file)]
-    for file in sorted(candidates, key=lambda file: len(file.parts)):
+def _calibration(
+    folder: Path, files: list[Path]
+) -> tuple[Path | None, tuple[Path, ...], tuple[str, ...]]:
+    """What places the cameras best, the others that could be read, and its cameras.
+
+    Lenses alone leave all cameras at one point; of files that place them, the one written last
+    has had its floor found last.
+    """
+    readable: list[tuple[tuple[bool, bool, int, float], Path, tuple[str, ...]]] = []
+    for file in (file for file in files if may_be_calibration(file)):
         for unit in ("m", "mm"):
             try:
-                return file.relative_to(folder), load_rig(file, unit=unit).names
+                rig = load_rig(file, unit=unit)
             except FusecapError:
                 continue
-    return None, ()
+            placed = len(rig) < 2 or camera_spread(rig) > SAME_PLACE_M
+            world = "world" in file.stem.lower()
+            rank = (placed, world, -len(file.parts), file.stat().st_mtime)
+            readable.append((rank, file.relative_to(folder), rig.names))
+            break
+    if not readable:
+        return None, (), ()
+    readable.sort(key=lambda item: item[0], reverse=True)
+    _, best, names = readable[0]
+    return best, tuple(path for _, path, _ in readable[1:]), names
 
 
 def _keypoint_format(folder: Path, keypoints: dict[str, Path]) -> str | None:
     for path in keypoints.values():
-        for file in sorted((folder / path).glob("*.json")):
-            alike = [s.name for s in LANDMARK_SETS.values() if _holds(file, s)]
-            if alike:
-                return f"openpose-{alike[0]}"
+        try:
+            alike = sets_in(folder / path)
+        except InputError:
+            continue
+        if alike:
+            return f"openpose-{alike[0].name}"
     return None
-
-
-def _holds(file: Path, landmarks: LandmarkSet) -> bool:
-    """Whether the file's first person has as many keypoints as the set."""
-    try:
-        people = json.loads(read_bytes(file, KEYPOINTS))["people"]
-        return len(people[0]["pose_keypoints_2d"]) == 3 * len(landmarks.landmark_names)
-    except (InputError, ValueError, KeyError, IndexError, TypeError, RecursionError):
-        return False
 
 
 def _sensors(folder: Path, file: Path) -> list[FoundSensor]:

@@ -28,6 +28,11 @@ from fusecap.sources.detection_files import read_record
 MAX_FRAME = 10**9
 """Longer numbers are dates or serials."""
 
+_OLD_KEY = "pose_keypoints"
+_KNOWN_SETS = "known are " + ", ".join(
+    f"{landmarks.keypoint_count} (openpose-{landmarks.name})"
+    for landmarks in LANDMARK_SETS.values()
+)
 _FRAME_NUMBER = re.compile(r"(\d+)(?:_keypoints)?$")
 
 
@@ -150,23 +155,42 @@ def read_people(path: Path, landmarks: LandmarkSet) -> np.ndarray | None:
 
 
 def _read_frame(path: str, landmarks: LandmarkSet) -> np.ndarray:
-    count = len(landmarks.landmark_names)
-    try:
-        entries = json.loads(read_bytes(path, KEYPOINTS))["people"]
-        flat = [entry["pose_keypoints_2d"] for entry in entries]
-    except (ValueError, KeyError, TypeError, InputError, RecursionError):
-        raise _BrokenFile from None
-    flat = [values for values in flat if values]
+    flat = [values for values in _persons(path) if values]
     for values in flat:
-        if not isinstance(values, list):
-            raise _BrokenFile
-        if len(values) != 3 * count:
+        if len(values) != 3 * landmarks.keypoint_count:
             raise _wrong_count(path, landmarks, values)
     try:
-        people = np.array(flat, dtype=np.float64).reshape(len(flat), count, 3)
+        people = np.array(flat, dtype=np.float64).reshape(len(flat), landmarks.keypoint_count, 3)
     except (ValueError, TypeError, OverflowError):
         raise _BrokenFile from None
-    return without_missing(people)
+    return without_missing(landmarks.of_keypoints(people))
+
+
+def _persons(path: str) -> list[list[Any]]:
+    """Everyone's numbers in one file; OpenPose left `_2d` out of their key before 2018."""
+    try:
+        people = json.loads(read_bytes(path, KEYPOINTS))["people"]
+        flat = [
+            person["pose_keypoints_2d"] if "pose_keypoints_2d" in person else person[_OLD_KEY]
+            for person in people
+        ]
+    except (ValueError, KeyError, TypeError, InputError, RecursionError):
+        raise _BrokenFile from None
+    if not all(isinstance(values, list) for values in flat):
+        raise _BrokenFile
+    return flat
+
+
+def sets_in(folder: Path) -> list[LandmarkSet]:
+    """Those with as many keypoints as the first person in a folder; raises `InputError`."""
+    for _, path in _numbered_files(folder):
+        try:
+            counts = {len(values) / 3 for values in _persons(path) if values}
+        except _BrokenFile:
+            continue
+        if counts:
+            return [s for s in LANDMARK_SETS.values() if s.keypoint_count in counts]
+    return []
 
 
 def without_missing(people: np.ndarray) -> np.ndarray:
@@ -186,10 +210,10 @@ def _wrong_count(path: str, landmarks: LandmarkSet, values: list[Any]) -> InputE
     alike = [
         f"'openpose-{other.name}'"
         for other in LANDMARK_SETS.values()
-        if len(other.landmark_names) == found
+        if other.keypoint_count == found
     ]
-    advice = f"it looks like {' or '.join(alike)}: set format" if alike else "check the detector"
+    advice = f"it looks like {' or '.join(alike)}: set format" if alike else _KNOWN_SETS
     return InputError(
         f"{path}: a person has {found:g} keypoints, expected the "
-        f"{len(landmarks.landmark_names)} of 'openpose-{landmarks.name}'; {advice}"
+        f"{landmarks.keypoint_count} of 'openpose-{landmarks.name}'; {advice}"
     )

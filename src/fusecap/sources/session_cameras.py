@@ -2,37 +2,64 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 from fusecap.body.landmarks import LandmarkSet, landmark_set_named
-from fusecap.errors import SessionError
+from fusecap.errors import InputError, SessionError
 from fusecap.findings import Finding
 from fusecap.geometry.camera import Rig
 from fusecap.progress import Progress
 from fusecap.sources.calibration_files import check_rig, load_rig
 from fusecap.sources.detection_files import read_record
-from fusecap.sources.keypoint_files import KeypointTrack, read_keypoints
+from fusecap.sources.keypoint_files import KeypointTrack, read_keypoints, sets_in
 from fusecap.sources.offset_files import read_offsets
 from fusecap.sources.session import CameraSettings, Session
+from fusecap.sources.video import probe
 
 
 def with_detections(session: Session) -> Session:
-    """The session with what `fusecap detect` left in its folder.
+    """The session with what its files say and it does not.
 
-    A camera that names a video only gets the folder of its keypoints, where these are complete and
-    the video still has the name and size that they were made from. A session that does not state
-    its rate takes that of the first detected video.
+    A camera that names a video only gets the folder of what `fusecap detect` found in it, where
+    that is complete and the video still has the name and size that it was made from. Keypoints
+    without a stated format get the one that their number tells, those beside a video its rate. A
+    session that does not state its rate takes that of the first camera that has one.
     """
-    cameras = tuple(_with_folder(session, camera) for camera in session.cameras)
+    cameras = tuple(_as_its_files_say(session, camera) for camera in session.cameras)
     settings = session.settings
-    if "rate_hz" not in settings.model_fields_set:
+    if not rate_is_stated(session):
         records = [read_record(c.keypoints) for c in cameras if c.keypoints and not c.rate_hz]
         rates_hz = [record.video.rate_hz for record in records if record is not None]
+        rates_hz += [camera.rate_hz for camera in cameras if camera.rate_hz]
         if rates_hz:
             settings = settings.model_copy(update={"rate_hz": rates_hz[0]})
     return session.model_copy(update={"cameras": cameras, "settings": settings})
 
 
+def rate_is_stated(session: Session) -> bool:
+    """Whether anything says how often the session is solved; else it is the default."""
+    return "rate_hz" in session.settings.model_fields_set
+
+
+def _as_its_files_say(session: Session, camera: CameraSettings) -> CameraSettings:
+    if camera.keypoints is None:
+        return _with_folder(session, camera)
+    if not camera.keypoints.is_dir() or read_record(camera.keypoints) is not None:
+        return camera
+    told: dict[str, object] = {}
+    if "format" not in camera.model_fields_set:
+        with suppress(InputError):
+            alike = [landmarks.name for landmarks in sets_in(camera.keypoints)]
+            if alike and camera.landmark_set_name not in alike:
+                told["format"] = f"openpose-{alike[0]}"
+    if camera.video is not None and camera.rate_hz is None and not rate_is_stated(session):
+        with suppress(InputError):
+            told["rate_hz"] = probe(camera.video).rate_hz
+    return camera.model_copy(update=told)
+
+
 def _with_folder(session: Session, camera: CameraSettings) -> CameraSettings:
-    if camera.keypoints is not None or camera.video is None:
+    if camera.video is None:
         return camera
     folder = session.detection_folder(camera)
     record = read_record(folder)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 
 from fusecap.body.skeleton import Skeleton, skeleton_named
 from fusecap.errors import InputError
 from fusecap.sources.folder_survey import FolderSurvey, FoundSensor
 from fusecap.sources.toml_text import quoted
+from fusecap.sources.video import probe
 
 SKELETON = "paper21"
 
@@ -21,7 +23,7 @@ def draft(found: FolderSurvey) -> str:
         )
     lines = ["[session]", f"name = {quoted(found.folder.resolve().name)}"]
     if found.calibration is not None:
-        lines.append(f"calibration = {quoted(found.calibration.as_posix())}")
+        lines.append(f"calibration = {quoted(found.calibration.as_posix())}{_why(found)}")
         if found.calibration.name.endswith((".qca.txt", ".qca")):
             lines.append('up = "z"   # as Qualisys has it')
     elif found.videos or found.keypoints:
@@ -29,20 +31,41 @@ def draft(found: FolderSurvey) -> str:
             "# fusecap calibrate intrinsics and fusecap calibrate extrinsics write it:",
             '# calibration = "calibration.toml"',
         ]
+    lines += _rate(found)
     return "\n".join([*lines, *_cameras(found), *_subject(found)]) + "\n"
 
 
+def _why(found: FolderSurvey) -> str:
+    others = ", ".join(path.as_posix() for path in found.other_calibrations)
+    return f"   # places the cameras; not chosen: {others}" if others else ""
+
+
 def _cameras(found: FolderSurvey) -> Iterator[str]:
-    sources = {path.stem: ("video", path) for path in found.videos}
-    sources |= {name: ("keypoints", path) for name, path in found.keypoints.items()}
-    for name in sorted(sources):
-        key, path = sources[name]
+    videos = {path.stem: path for path in found.videos}
+    for name in sorted({*videos, *found.keypoints}):
         yield from ("", "[[camera]]", f"name = {quoted(name)}")
-        yield f"{key} = {quoted(path.as_posix())}"
-        if key == "keypoints" and found.keypoint_format:
-            yield f"format = {quoted(found.keypoint_format)}"
+        if name in videos:
+            yield f"video = {quoted(videos[name].as_posix())}"
+        if name in found.keypoints:
+            yield f"keypoints = {quoted(found.keypoints[name].as_posix())}"
+            if found.keypoint_format:
+                yield f"format = {quoted(found.keypoint_format)}"
         if found.cameras and name not in found.cameras:
             yield f"# the calibration has no camera of this name, only: {', '.join(found.cameras)}"
+    for path in found.made:
+        yield from ("", f"# left out, as it looks like a drawing of another video: {path}")
+
+
+def _rate(found: FolderSurvey) -> Iterator[str]:
+    """Of the first video that can be read; keypoints alone do not tell theirs."""
+    for path in found.videos:
+        with suppress(InputError):
+            rate_hz = probe(found.folder / path).rate_hz
+            yield f"rate_hz = {round(rate_hz, 3):g}   # as {path.name} says"
+            return
+    if found.keypoints and not found.videos:
+        yield "# rate_hz = 60   # of the cameras: files of keypoints do not state it, and times"
+        yield "#                  and speeds are wrong by as much as it is"
 
 
 def _subject(found: FolderSurvey) -> Iterator[str]:

@@ -15,6 +15,10 @@ from fusecap.sources.imu_files import ImuTrack, read_imu
 from fusecap.sources.session import ImuSettings, SubjectSettings
 from fusecap.sources.synchronizer import MountedImu, world_from_imu_world
 
+LEAST_COMMON = 0.5
+"""Of the shortest recording: of sensors that share less of it by their clock, it is not one."""
+_NOT_SYNCHRONISED = "its counter is not on the other sensors' clock"
+
 
 def open_imus(subject: SubjectSettings) -> list[ImuTrack]:
     """The subject's tracks on the recorder's clock, each with its `offset_s`.
@@ -33,9 +37,9 @@ def open_some_imus(
         attempt(f"imu '{imu.bone}' of '{subject.name}'", lambda imu=imu: _read(subject, imu))
         for imu in subject.imus
     ]
-    delays = iter(_shared_delays_s([track for track in tracks if track is not None]))
+    read = iter(_on_shared_clocks([track for track in tracks if track is not None]))
     return [
-        track and replace(track, times_s=track.times_s + next(delays) + imu.offset_s)
+        track and _later(next(read), imu.offset_s)
         for track, imu in zip(tracks, subject.imus, strict=True)
     ]
 
@@ -49,15 +53,33 @@ def _read(subject: SubjectSettings, imu: ImuSettings) -> ImuTrack:
     return read_imu(imu.file, format=imu.format, sensor=imu.sensor, rate_hz=imu.rate_hz)
 
 
-def _shared_delays_s(tracks: list[ImuTrack]) -> list[float]:
-    delays = [0.0] * len(tracks)
+def _later(track: ImuTrack, delay_s: float) -> ImuTrack:
+    return replace(track, times_s=track.times_s + delay_s)
+
+
+def _on_shared_clocks(tracks: list[ImuTrack]) -> list[ImuTrack]:
+    """Each as much later than the earliest as their recorder's clock says.
+
+    Sensors that were not synchronised count on their own: by the clock they would hardly have
+    measured at once, so it is none that they share, and all start at 0.
+    """
+    placed = list(tracks)
     for period_s in {track.clock.period_s for track in tracks if track.clock}:
         group = [i for i, t in enumerate(tracks) if t.clock and t.clock.period_s == period_s]
         starts = np.array([t.clock.start_s for i, t in enumerate(tracks) if i in group and t.clock])
         behind = np.mod(starts - starts[0] + period_s / 2, period_s) - period_s / 2
-        for i, delay in zip(group, behind - behind.min(), strict=True):
-            delays[i] = float(delay)
-    return delays
+        behind -= behind.min()
+        lengths = np.array([float(np.ptp(tracks[i].times_s)) for i in group])
+        common = (behind + lengths).min() - behind.max()
+        if len(group) > 1 and common < LEAST_COMMON * lengths.min():
+            for i in group:
+                placed[i] = replace(
+                    tracks[i], clock=None, notes=(*tracks[i].notes, _NOT_SYNCHRONISED)
+                )
+            continue
+        for i, delay_s in zip(group, behind, strict=True):
+            placed[i] = _later(tracks[i], float(delay_s))
+    return placed
 
 
 def sensor_notes(subject: SubjectSettings, tracks: Sequence[ImuTrack | None]) -> list[Finding]:
@@ -65,25 +87,37 @@ def sensor_notes(subject: SubjectSettings, tracks: Sequence[ImuTrack | None]) ->
 
     Lost samples are one finding per subject: radio drops some of nearly every sensor's.
     """
-    findings, lost = [], []
+    findings, lost, alone = [], [], []
     for imu, track in zip(subject.imus, tracks, strict=True):
         for note in () if track is None else track.notes:
             if "samples lost" in note:
                 lost.append((imu.bone, note))
+            elif note == _NOT_SYNCHRONISED:
+                alone.append(imu.bone)
             else:
                 where = f"imu '{imu.bone}' of '{subject.name}'"
                 findings.append(Finding(severity="warning", where=where, found=note, remedy=""))
     if lost:
         each = ", ".join(f"{bone} {note.replace(' samples lost', '')}" for bone, note in lost)
-        alone = len(lost) == 1
+        single = len(lost) == 1
         findings.append(
             Finding(
                 severity="warning",
                 where=f"imu '{lost[0][0]}' of '{subject.name}'"
-                if alone
+                if single
                 else f"sensors of '{subject.name}'",
-                found=lost[0][1] if alone else f"samples lost: {each}",
+                found=lost[0][1] if single else f"samples lost: {each}",
                 remedy="gaps over 0.1 s are not bridged",
+            )
+        )
+    if alone:
+        findings.append(
+            Finding(
+                severity="warning",
+                where=f"sensors of '{subject.name}'",
+                found=f"their counters do not share a clock ({', '.join(alone)}): each starts at 0",
+                remedy="synchronise sensors before recording; fusecap calibrate sync finds each "
+                "one's delay from motion the cameras saw, offset_s states it",
             )
         )
     return findings

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,8 +25,9 @@ class ImuFormat:
     sensors: Callable[[Path], tuple[str, ...]] | None = None
     """Names of the sensors in a file that holds several."""
     suffixes: tuple[str, ...] = (".csv", ".txt", ".sto")
-    mark: str = ""
-    """What stands near the beginning of such a file, in any case of letters."""
+    marks: tuple[str, ...] = ("",)
+    """One of them stands near the beginning of such a file, in any case of letters; a comma is
+    whatever stands between cells."""
 
 
 def read_imu(
@@ -61,7 +63,13 @@ def imu_format_of(path: Path) -> str | None:
         return None
     try:
         with open_input(path, SENSORS) as file:
-            head = file.read(_SNIFFED_BYTES).decode("utf-8", "replace").lower()
+            head = file.read(_SNIFFED_BYTES)
     except (InputError, OSError):
         return None
-    return next((name for name in likely if format_named(name).mark.lower() in head), None)
+    text = head.replace(b"\0", b"").decode("utf-8", "replace").lower()
+    text = re.sub("[\t;]", ",", text.replace('"', ""))
+    return next((name for name in likely if _carries(format_named(name), text)), None)
+
+
+def _carries(format: ImuFormat, text: str) -> bool:
+    return any(mark.lower() in text for mark in format.marks)

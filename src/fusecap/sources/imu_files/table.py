@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import codecs
+import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from fusecap.errors import InputError, nearest
-from fusecap.inputs import SENSORS, read_text
+from fusecap.inputs import SENSORS, read_bytes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -19,6 +21,8 @@ class ImuTable:
     path: Path
     preamble: tuple[str, ...]
     columns: tuple[str, ...]
+    units: tuple[str, ...]
+    """The cells of the last line without a number between header and rows, if any."""
     rows: np.ndarray
     """(N, columns); NaN for empty or unreadable cells and for what a cut-off last line lacks."""
 
@@ -33,38 +37,73 @@ class ImuTable:
                 raise InputError(f"{self.path}: no column '{name}'{nearest(name, self.columns)}")
         return self.rows[:, [self.columns.index(name) for name in names]]
 
-    def take_or_nan(self, names: Sequence[str]) -> np.ndarray:
-        """`take`, or NaN when a column is missing."""
-        if not self.has(names):
-            return np.full((len(self.rows), len(names)), np.nan)
-        return self.take(names)
+    def accelerations(self, names: Sequence[str]) -> tuple[np.ndarray | None, tuple[str, ...]]:
+        """(N, 3), and a note where columns that look like accelerations are not these."""
+        if self.has(names):
+            return self.take(names), ()
+        others = [column for column in self.columns if "acc" in column.lower()]
+        if not others:
+            return None, ()
+        listed = ", ".join(others[:3]) + ", ..." * (len(others) > 3)
+        return None, (f"no accelerations were read: {listed} are not {', '.join(names)}",)
 
 
 def read_lines(path: Path) -> list[str]:
-    """The lines of a text file; raises `InputError`."""
-    return read_text(path, SENSORS, strict=False).splitlines()
+    """The lines of a text file in UTF-8 or UTF-16; raises `InputError`."""
+    content = read_bytes(path, SENSORS)
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return content.decode("utf-16", "replace").splitlines()
+    return content.decode("utf-8-sig", "replace").splitlines()
 
 
-def read_table(path: Path, first_column: str, *, units_line: bool = False) -> ImuTable:
-    """The table whose header line starts with `first_column`; tabs, commas or semicolons.
+def read_table(path: Path, *first_columns: str) -> ImuTable:
+    """The table whose header line starts with one of `first_columns`.
 
-    Raises `InputError` when there is no such header or no row under it.
+    Cells stand between tabs, commas or semicolons, in quotes or not; numbers may have a decimal
+    comma. Lines below the header without any number, as of units, are passed over. Raises
+    `InputError` when there is no such header, no row under it, or when commas between cells and
+    commas in numbers cannot be told apart.
     """
     lines = read_lines(path)
-    headers = (i for i, line in enumerate(lines) if line.lstrip().startswith(first_column))
+    starts = tuple(first_columns)
+    headers = (i for i, line in enumerate(lines) if line.lstrip(' \t"').startswith(starts))
     index = next(headers, None)
     if index is None:
         raise InputError(
-            f"{path}: no header line that starts with '{first_column}'; "
+            f"{path}: no header line that starts with '{starts[0]}'; "
             "check that the file is of the stated format"
         )
     delimiter = max("\t,;", key=lines[index].count)
-    columns = tuple(cell.strip() for cell in lines[index].split(delimiter))
-    body = lines[index + 1 + units_line :]
-    rows = [_numbers(line.split(delimiter), len(columns)) for line in body if line.strip()]
-    if not rows:
+    columns = tuple(cell.strip() for cell in _cells(lines[index : index + 1], delimiter)[0])
+    body = _cells([line for line in lines[index + 1 :] if line.strip()], delimiter)
+    if delimiter == ",":
+        _refuse_decimal_comma(path, columns, body)
+    rows = [_numbers(cells, len(columns)) for cells in body]
+    first = next((i for i, row in enumerate(rows) if np.isfinite(row).any()), 0)
+    if first >= len(rows) or not rows:
         raise InputError(f"{path}: no samples below the header; export the recording again")
-    return ImuTable(path=path, preamble=tuple(lines[:index]), columns=columns, rows=np.array(rows))
+    return ImuTable(
+        path=path,
+        preamble=tuple(lines[:index]),
+        columns=columns,
+        units=tuple(body[first - 1]) if first else (),
+        rows=np.array(rows[first:]),
+    )
+
+
+def _cells(lines: list[str], delimiter: str) -> list[list[str]]:
+    return list(csv.reader(lines, delimiter=delimiter))
+
+
+def _refuse_decimal_comma(path: Path, columns: Sequence[str], body: list[list[str]]) -> None:
+    """Commas between cells and in numbers double the cells of most lines."""
+    doubled = [cells for cells in body if len(cells) > 1.5 * len(columns)]
+    if len(doubled) > len(body) / 2:
+        raise InputError(
+            f"{path}: lines have {len(doubled[0])} cells under {len(columns)} columns, from "
+            f"'{','.join(doubled[0][:2])}' on: the decimal sign is a comma, as is what stands "
+            "between cells; export with a decimal point, or with semicolons or tabs between cells"
+        )
 
 
 def _numbers(cells: list[str], count: int) -> list[float]:
@@ -73,9 +112,9 @@ def _numbers(cells: list[str], count: int) -> list[float]:
 
 
 def number(cell: str) -> float:
-    """The cell's value; NaN where it is none."""
+    """The cell's value, also with a decimal comma; NaN where it is none."""
     try:
-        return float(cell)
+        return float(cell.replace(",", ".", 1))
     except ValueError:
         return float("nan")
 

@@ -6,14 +6,20 @@ and says what it did. An accelerometer measures specific force: at rest it reads
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from fusecap.errors import InputError
-from fusecap.geometry.quaternions import from_wxyz
+from fusecap.geometry.quaternions import from_wxyz, to_wxyz
 from fusecap.types import GRAVITY_M_S2
 
+EPOCH_ABOVE_S = 1e8
+"""Times beyond three years count from 1970."""
+EPOCH_PERIOD_S = 2.0**33
+"""Far longer than any of them, and still resolved to a microsecond."""
 _UNIT_TOLERANCE = 0.01
 
 
@@ -53,17 +59,24 @@ def tidy(
     where: str,
     times_s: np.ndarray,
     orientation_wxyz: np.ndarray,
-    accel_m_s2: np.ndarray,
+    accel_m_s2: np.ndarray | None,
     *,
     clock: SharedClock | None = None,
     notes: tuple[str, ...] = (),
 ) -> ImuTrack:
     """A track from raw columns; raises `InputError` when no sample is left.
 
+    None for accelerations stands for a file without any; of one whose cells all cannot be read a
+    note says so.
+
     Rows without a time or an orientation are dropped, non-finite accelerations become NaN, rows
     are sorted by time, of equal times the first is kept, quaternions are normalised.
     """
     said = list(notes)
+    if accel_m_s2 is None:
+        accel_m_s2 = np.full((len(times_s), 3), np.nan)
+    elif not np.isfinite(accel_m_s2).all(axis=1).any():
+        said.append("no accelerations were read: none of their cells is a number")
     norm = np.linalg.norm(orientation_wxyz, axis=1)
     whole = np.isfinite(times_s) & np.isfinite(norm)
     usable = whole & (norm > 0.1)
@@ -113,6 +126,38 @@ def specific_force(
         with_gravity = free_accel_in_imu_world_m_s2[usable] + [0.0, 0.0, GRAVITY_M_S2]
         result[usable] = imu_world_from_imu.inv().apply(with_gravity)
     return result
+
+
+def wxyz_of_matrices(matrices: np.ndarray) -> np.ndarray:
+    """(N, 4) of (N, 3, 3); NaN where a matrix is no rotation."""
+    usable = np.all(np.isfinite(matrices), axis=(1, 2))
+    usable &= np.linalg.det(np.nan_to_num(matrices)) > 0.1
+    return _wxyz(usable, Rotation.from_matrix, matrices)
+
+
+def wxyz_of_euler(roll_pitch_yaw_deg: np.ndarray) -> np.ndarray:
+    """(N, 4) of (N, 3) in degrees, Rz(yaw) Ry(pitch) Rx(roll); NaN where an angle is."""
+    usable = np.all(np.isfinite(roll_pitch_yaw_deg), axis=1)
+    return _wxyz(
+        usable, lambda angles: Rotation.from_euler("xyz", angles, degrees=True), roll_pitch_yaw_deg
+    )
+
+
+def _wxyz(
+    usable: np.ndarray, rotation: Callable[[np.ndarray], Rotation], values: np.ndarray
+) -> np.ndarray:
+    result = np.full((len(values), 4), np.nan)
+    if usable.any():
+        result[usable] = to_wxyz(rotation(values[usable]))
+    return result
+
+
+def since_first(times_s: np.ndarray) -> tuple[np.ndarray, SharedClock | None]:
+    """Times, and the clock that they share where they count from 1970: then the first is 0."""
+    first = float(np.nanmin(times_s)) if np.isfinite(times_s).any() else 0.0
+    if first < EPOCH_ABOVE_S:
+        return times_s, None
+    return times_s - first, SharedClock(start_s=first, period_s=EPOCH_PERIOD_S)
 
 
 def unwrapped(counter: np.ndarray, modulus: int) -> np.ndarray:

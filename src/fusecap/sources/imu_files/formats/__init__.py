@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from fusecap.sources.imu_files.loader import ImuFormat
 
-NAMES = ("csv", "xsens-dot", "xsens-mt", "mvnx", "sto", "apdm-csv", "gaittoolbox-csv")
+NAMES = ("csv", "xsens-mt", "xsens-dot", "mvnx", "sto", "apdm-csv", "gaittoolbox-csv")
 """As a session writes them; a module's name has underscores. Of two whose marks a file carries, the
-first is its format: DOT has Xsens MT's counter too."""
+first is its format: MT Manager writes an empty SampleTimeFine, DOT's clock."""
 
 
 def format_named(name: str) -> ImuFormat:

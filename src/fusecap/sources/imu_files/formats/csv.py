@@ -1,7 +1,7 @@
 """Our own CSV: `time_s,qw,qx,qy,qz,ax,ay,az`, further columns ignored (docs/formats.md).
 
 The quaternion is imu_world_from_imu; acceleration is specific force in the imu frame [m/s²], and
-may be left out or NaN.
+may be left out or NaN. Times may also be `time_ms`, `time_us` or `time_ns`, and count from 1970.
 """
 
 from __future__ import annotations
@@ -10,18 +10,25 @@ from pathlib import Path
 
 from fusecap.sources.imu_files.loader import ImuFormat
 from fusecap.sources.imu_files.table import read_table
-from fusecap.sources.imu_files.track import ImuTrack, tidy
+from fusecap.sources.imu_files.track import ImuTrack, since_first, tidy
+
+_SECONDS = {"time_s": 1.0, "time_ms": 1e-3, "time_us": 1e-6, "time_ns": 1e-9}
 
 
 def read(path: Path, _sensor: str | None, _rate_hz: float | None) -> ImuTrack:
     """The samples; raises `InputError`."""
-    table = read_table(path, "time_s")
+    table = read_table(path, *_SECONDS)
+    unit = next(column for column in table.columns if column in _SECONDS)
+    times_s, clock = since_first(table.take([unit])[:, 0] * _SECONDS[unit])
+    accelerations, notes = table.accelerations(["ax", "ay", "az"])
     return tidy(
         str(path),
-        table.take(["time_s"])[:, 0],
+        times_s,
         table.take(["qw", "qx", "qy", "qz"]),
-        table.take_or_nan(["ax", "ay", "az"]),
+        accelerations,
+        clock=clock,
+        notes=notes,
     )
 
 
-FORMAT = ImuFormat(read=read, mark="time_s,qw")
+FORMAT = ImuFormat(read=read, marks=tuple(f"{time},qw" for time in _SECONDS))

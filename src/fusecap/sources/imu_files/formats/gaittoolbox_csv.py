@@ -26,12 +26,14 @@ def read(path: Path, _sensor: str | None, rate_hz: float | None) -> ImuTrack:
     rate = float(match.group(1)) if match else rate_hz
     if not rate:
         raise InputError(f"{path}: the header states no fs; give rate_hz of this imu")
+    accelerations, notes = table.accelerations([f"acc_{i}" for i in (1, 2, 3)])
     return tidy(
         str(path),
         np.arange(len(table.rows)) / rate,
         table.take([f"ori_{i}" for i in (1, 2, 3, 4)]),
-        table.take_or_nan([f"acc_{i}" for i in (1, 2, 3)]),
+        accelerations,
+        notes=notes,
     )
 
 
-FORMAT = ImuFormat(read=read, mark="ori_1")
+FORMAT = ImuFormat(read=read, marks=("ori_1",))

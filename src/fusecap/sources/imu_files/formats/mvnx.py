@@ -33,7 +33,8 @@ def read(path: Path, sensor: str | None, _rate_hz: float | None) -> ImuTrack:
     force = _vectors(frames, "sensorAcceleration", index, 3)
     free = _vectors(frames, "sensorFreeAcceleration", index, 3)
     if np.all(np.isnan(force)):
-        force = specific_force(quaternion, free)
+        measured = np.isfinite(free).any()
+        force = specific_force(quaternion, free) if measured else None
     return tidy(f"{path} sensor '{name}'", _times_s(root, frames), quaternion, force)
 
 

@@ -31,7 +31,7 @@ def read(path: Path, sensor: str | None, _rate_hz: float | None) -> ImuTrack:
         f"{path} sensor '{name}'",
         numbers[:, 0],
         numbers[:, 1:],
-        np.full((len(numbers), 3), np.nan),
+        None,
         notes=(f"{len(rows) - len(whole)} broken rows dropped",) if len(whole) < len(rows) else (),
     )
 
@@ -55,4 +55,4 @@ def _table(path: Path) -> tuple[list[str], list[str]]:
     return body[0].split("\t"), body[1:]
 
 
-FORMAT = ImuFormat(read=read, sensors=sensors, mark="DataType=Quaternion")
+FORMAT = ImuFormat(read=read, sensors=sensors, marks=("DataType=Quaternion",))

@@ -1,7 +1,9 @@
-"""Xsens DOT recordings: `PacketCounter,SampleTimeFine,Quat_W..Z,FreeAcc_X..Z`.
+"""Xsens DOT recordings: `PacketCounter,SampleTimeFine,` and what the payload mode measured.
 
-`SampleTimeFine` counts microseconds in 32 bits, on one clock for synchronised sensors. `FreeAcc`
-is acceleration without gravity in the imu world (z up).
+    Quat_W..Z or Euler_X..Z    imu_world (z up) from imu; Euler in degrees, Rz Ry Rx
+    FreeAcc_X..Z or Acc_X..Z   without gravity in the imu world, or specific force in the imu frame
+
+`SampleTimeFine` counts microseconds in 32 bits, on one clock for synchronised sensors.
 """
 
 from __future__ import annotations
@@ -10,31 +12,59 @@ from pathlib import Path
 
 import numpy as np
 
+from fusecap.errors import InputError
 from fusecap.sources.imu_files.loader import ImuFormat
-from fusecap.sources.imu_files.table import read_table
-from fusecap.sources.imu_files.track import ImuTrack, SharedClock, specific_force, tidy, unwrapped
+from fusecap.sources.imu_files.table import ImuTable, read_table
+from fusecap.sources.imu_files.track import (
+    ImuTrack,
+    SharedClock,
+    specific_force,
+    tidy,
+    unwrapped,
+    wxyz_of_euler,
+)
 
 TICKS_PER_SECOND = 1e6
 CLOCK_MODULUS = 2**32
+_QUATERNION = ["Quat_W", "Quat_X", "Quat_Y", "Quat_Z"]
+_EULER = ["Euler_X", "Euler_Y", "Euler_Z"]
+_ACC = ["Acc_X", "Acc_Y", "Acc_Z"]
+_FREE_ACC = ["FreeAcc_X", "FreeAcc_Y", "FreeAcc_Z"]
 
 
 def read(path: Path, _sensor: str | None, _rate_hz: float | None) -> ImuTrack:
     """The samples, starting at time 0; raises `InputError`."""
     table = read_table(path, "PacketCounter")
     ticks = table.take(["SampleTimeFine"])[:, 0]
-    quaternion = table.take(["Quat_W", "Quat_X", "Quat_Y", "Quat_Z"])
+    quaternion = _orientation_wxyz(table)
     counted = np.isfinite(ticks)
     ticks[counted] = unwrapped(ticks[counted], CLOCK_MODULUS)
     first = float(np.nanmin(ticks)) if counted.any() else 0.0
+    if not table.has(_ACC) and table.has(_FREE_ACC):
+        accelerations, notes = specific_force(quaternion, table.take(_FREE_ACC)), ()
+    else:
+        accelerations, notes = table.accelerations(_ACC)
     return tidy(
         str(path),
         (ticks - first) / TICKS_PER_SECOND,
         quaternion,
-        specific_force(quaternion, table.take_or_nan(["FreeAcc_X", "FreeAcc_Y", "FreeAcc_Z"])),
+        accelerations,
         clock=SharedClock(
             start_s=first / TICKS_PER_SECOND, period_s=CLOCK_MODULUS / TICKS_PER_SECOND
         ),
+        notes=notes,
     )
 
 
-FORMAT = ImuFormat(read=read, mark="SampleTimeFine")
+def _orientation_wxyz(table: ImuTable) -> np.ndarray:
+    if table.has(_QUATERNION):
+        return table.take(_QUATERNION)
+    if table.has(_EULER):
+        return wxyz_of_euler(table.take(_EULER))
+    raise InputError(
+        f"{table.path}: no orientation (Quat_W..Z or Euler_X..Z); record in a payload mode that "
+        "has one, such as 'Extended (Quaternion)' or 'Complete (Quaternion)'"
+    )
+
+
+FORMAT = ImuFormat(read=read, marks=("SampleTimeFine",))

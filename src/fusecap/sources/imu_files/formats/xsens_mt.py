@@ -14,13 +14,18 @@ import re
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from fusecap.errors import InputError
-from fusecap.geometry.quaternions import to_wxyz
 from fusecap.sources.imu_files.loader import ImuFormat
 from fusecap.sources.imu_files.table import ImuTable, read_table
-from fusecap.sources.imu_files.track import ImuTrack, SharedClock, tidy, unwrapped
+from fusecap.sources.imu_files.track import (
+    ImuTrack,
+    SharedClock,
+    tidy,
+    unwrapped,
+    wxyz_of_euler,
+    wxyz_of_matrices,
+)
 
 PACKET_MODULUS = 65536
 _QUATERNION = [f"Quat_q{i}" for i in range(4)]
@@ -40,12 +45,14 @@ def read(path: Path, _sensor: str | None, rate_hz: float | None) -> ImuTrack:
     if not counted.any():
         raise InputError(f"{path}: PacketCounter is empty; export it, it is the time of a sample")
     first = float(np.nanmin(packets))
+    accelerations, notes = table.accelerations(["Acc_X", "Acc_Y", "Acc_Z"])
     return tidy(
         str(path),
         (packets - first) / rate,
         _orientation_wxyz(table),
-        table.take_or_nan(["Acc_X", "Acc_Y", "Acc_Z"]),
+        accelerations,
         clock=SharedClock(start_s=first / rate, period_s=PACKET_MODULUS / rate),
+        notes=notes,
     )
 
 
@@ -65,25 +72,13 @@ def _orientation_wxyz(table: ImuTable) -> np.ndarray:
     if table.has(_QUATERNION):
         return table.take(_QUATERNION)
     if table.has(_MATRIX):
-        numbers = table.take(_MATRIX).reshape(-1, 3, 3)
-        usable = np.isfinite(numbers).all(axis=(1, 2))
-        usable &= np.linalg.det(np.nan_to_num(numbers)) > 0.1
-        rotation = Rotation.from_matrix(numbers[usable]) if usable.any() else None
-    elif table.has(_EULER_XYZ):
-        numbers = table.take(_EULER_XYZ)
-        usable = np.all(np.isfinite(numbers), axis=1)
-        rotation = (
-            Rotation.from_euler("xyz", numbers[usable], degrees=True) if usable.any() else None
-        )
-    else:
-        raise InputError(
-            f"{table.path}: no orientation; export quaternions (Quat_q0..3), the rotation matrix "
-            "(Mat[1][1]..) or Euler angles (Roll, Pitch, Yaw) from MT Manager"
-        )
-    result = np.full((len(numbers), 4), np.nan)
-    if rotation is not None:
-        result[usable] = to_wxyz(rotation)
-    return result
+        return wxyz_of_matrices(table.take(_MATRIX).reshape(-1, 3, 3))
+    if table.has(_EULER_XYZ):
+        return wxyz_of_euler(table.take(_EULER_XYZ))
+    raise InputError(
+        f"{table.path}: no orientation; export quaternions (Quat_q0..3), the rotation matrix "
+        "(Mat[1][1]..) or Euler angles (Roll, Pitch, Yaw) from MT Manager"
+    )
 
 
-FORMAT = ImuFormat(read=read, mark="PacketCounter")
+FORMAT = ImuFormat(read=read, marks=("Quat_q0", "Mat[1][1]", "Roll,Pitch"))
