@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from fusecap.engine.engine import Engine
-from fusecap.errors import SessionError
-from fusecap.types import CameraSample, Tick
+from fusecap.errors import InputError, SessionError
+from fusecap.types import CameraSample, ImuReading, Observation, Tick
 from live_events import same_bits, steps_of
 from live_scene import Phase, capture, fastest, samples_of, score, simulated_setup, ticks_of
 
@@ -114,6 +114,46 @@ def test_where_pictures_come_as_soon_as_sensors_the_solved_pose_is_sent(simulati
         sent += step is not None and step.timestamp_ns == tick.timestamp_ns
         assert engine.take(Tick(timestamp_ns=tick.timestamp_ns, ahead=True)) is None, "once"
     assert sent == len(ticks)
+
+
+@pytest.mark.slow
+def test_settled_poses_are_held_while_nothing_measures(simulation, tmp_path):
+    engine = Engine(setup_with(simulation, tmp_path, 'poses = "settled"'))
+    silent = range(1_200_000_000, 1_800_000_000)
+    events = [
+        e
+        for e in events_of(simulation, ahead=False)
+        if isinstance(e, Tick) or e.timestamp_ns not in silent
+    ]
+    steps = list(steps_of(engine, events))
+    apart = np.diff([step.timestamp_ns for step in steps])
+    assert apart.max() < 18_000_000, "sent at every instant"
+    assert all(step.people["anna"] is not None for step in steps[40:])
+
+
+@pytest.mark.slow
+def test_nonsense_ahead_is_refused_and_changes_nothing(simulation, tmp_path):
+    setup = setup_with(simulation, tmp_path, 'poses = "ahead"')
+    plain, tried = Engine(setup), Engine(setup)
+    for event in events_of(simulation, ahead=False)[:3000]:
+        plain.take(event)
+        tried.take(event)
+        for estimate in tried._step.estimates if isinstance(event, Tick) else ():
+            estimator = tried._pipeline.estimator(estimate.name)
+            keypoints = np.zeros((4, 25, 3))
+            reading = ImuReading(
+                bone_rotation_in_world=np.zeros((2, 3, 3)), accel_in_world_m_s2=np.zeros((2, 3))
+            )
+            later = event.timestamp_ns + 16_666_667
+            for bad in (
+                Observation(timestamp_ns=later, keypoints=keypoints, imu=reading),
+                Observation(timestamp_ns=later, keypoints=keypoints[:2]),
+                Observation(timestamp_ns=event.timestamp_ns, keypoints=keypoints),
+            ):
+                with pytest.raises(InputError):
+                    estimator.ahead(bad)
+    for ours, theirs in zip(plain._step.estimates, tried._step.estimates, strict=True):
+        assert np.array_equal(ours.theta, theirs.theta)
 
 
 def test_a_tick_ahead_before_anything_was_solved_sends_nothing(simulation, tmp_path):

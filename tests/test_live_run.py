@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fusecap.errors import SessionError
 from fusecap.live.devices.source import SessionClock, SourceLost
 from fusecap.live.health import Incidents, Input, Meter
 from fusecap.live.inbox import Inbox
@@ -131,6 +133,37 @@ def test_without_anything_fresh_eager_waits_for_the_delay():
     with Going(make_run(engine=engine, options=options, clock=clock)):
         wait_for(lambda: len(engine.ticks) > 3)
         assert clock.now_ns() - engine.ticks[-1] >= 50_000_000
+
+
+def test_poses_ahead_leave_at_once_and_pictures_are_solved_when_their_delay_is_over():
+    engine, clock = FakeEngine(), SessionClock()
+    setup = live_setup(ring(0))
+    live = setup.session.live.model_copy(update={"poses": "ahead"})
+    setup = replace(setup, session=setup.session.model_copy(update={"live": live}))
+    source = FakeSource("imus", steady(clock, imu_sample, 200.0))
+    taken_ns = []
+    engine = FakeEngine(on_take=lambda event: taken_ns.append((clock.now_ns(), event)))
+    options = LiveOptions(delay_s=0.1, eager=False)
+    run = LiveRun(setup, [source], None, options, engine=engine, clock=clock)
+    with Going(run):
+        wait_for(lambda: len(engine.ticks) > 30)
+    ticks = [(ns, event) for ns, event in taken_ns if isinstance(event, Tick)]
+    seen = [(ns - tick.timestamp_ns, tick.timestamp_ns) for ns, tick in ticks if not tick.ahead]
+    ahead = [(ns - tick.timestamp_ns, tick.timestamp_ns) for ns, tick in ticks if tick.ahead]
+    assert len(seen) > 3 and len(ahead) > 10
+    assert all(late_ns >= 100_000_000 for late_ns, _ in seen)
+    assert np.median([late_ns for late_ns, _ in ahead]) < 50_000_000
+    for some in (seen, ahead):
+        times = [timestamp_ns for _, timestamp_ns in some]
+        assert times == sorted(set(times))
+
+
+def test_poses_ahead_of_pictures_that_are_too_late_are_refused():
+    setup = live_setup(ring(0))
+    live = setup.session.live.model_copy(update={"poses": "ahead"})
+    setup = replace(setup, session=setup.session.model_copy(update={"live": live}))
+    with pytest.raises(SessionError, match=r"0\.3 s beyond pictures"):
+        LiveRun(setup, [], None, LiveOptions(delay_s=0.4), engine=FakeEngine())
 
 
 def test_commands_stand_in_their_place_among_the_samples():

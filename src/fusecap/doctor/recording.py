@@ -36,7 +36,7 @@ def diagnose_recording(path: Path | str, progress: Progress | None = None) -> li
             case RecordedEvent(event=ImuSample() as sample):
                 sensors[sample.subject][sample.bone].append(sample.timestamp_ns)
             case RecordedEvent(event=Tick() as tick):
-                ticks_ns.append(tick.timestamp_ns)
+                ticks_ns += [] if tick.ahead else [tick.timestamp_ns]
             case RecordedEvent():
                 commands += 1
             case RecordedPose():

@@ -40,6 +40,8 @@ from fusecap.types import (
 
 FARTHEST_AHEAD_S = 0.3
 """Of pictures: longer nobody goes on as before."""
+_ROUNDED_NS = 1_000_000
+"""By which an instant's time may be off its period."""
 LOST_S = 1.0
 """Without any measurement before a person is said to be lost."""
 
@@ -75,6 +77,11 @@ class Engine:
         self._sensors = Sensors(session.subjects)
         solved = setup_of(session, setup.rig, setup.landmarks)
         self._live = session.live
+        self._settle_s = (
+            math.ceil(session.live.settle_s * session.settings.rate_hz - 1e-6)
+            / session.settings.rate_hz
+        )
+        """In whole instants."""
         self._pipeline = Pipeline(
             replace(solved, options=_with_room(solved.options, session.live, solved.rate_hz))
         )
@@ -134,11 +141,13 @@ class Engine:
             return None
         if self._live.poses == "solved":
             return self._send(now_ns, self._step.estimates, readings)
-        settled = self._pipeline.settled(self._live.settle_s)
-        settled_ns = now_ns - round(self._live.settle_s * 1e9)
-        return self._send(
-            max((s.timestamp_ns for s in settled), default=settled_ns), settled, readings
-        )
+        settled_ns = now_ns - round(self._settle_s * 1e9)
+        settled = [
+            estimate
+            for estimate in self._pipeline.settled(self._settle_s)
+            if abs(estimate.timestamp_ns - settled_ns) <= _ROUNDED_NS
+        ]
+        return self._send(settled_ns, settled, readings)
 
     def _look_ahead(self, now_ns: int) -> LiveStep | None:
         if self._last_ns is None:

@@ -173,7 +173,9 @@ class Solving:
             if not (due or (self._eager and self._engine.ready(timestamp_ns))):
                 return
             self._solve(Tick(timestamp_ns=timestamp_ns))
-            self._next = self._following(self._next, self._delay_ns)
+            following = self._following(self._next, self._delay_ns)
+            self.skipped += following - self._next - 1
+            self._next = following
 
     def _following(self, instant: int, delay_ns: int) -> int:
         """The next one to solve."""

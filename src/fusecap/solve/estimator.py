@@ -186,7 +186,7 @@ class Estimator:
         if landmarks_in_world_m is None:
             landmarks_in_world_m = np.full((len(self._landmark_bones), 3), np.nan)
         landmarks_in_world_m = believable_points(landmarks_in_world_m, len(self._landmark_bones))
-        observation = self._believed(observation)
+        observation = self._believed(observation, self._last_ns)
         self._last_ns = observation.timestamp_ns
         self._learn_shape(landmarks_in_world_m)
         data = self._measurements(observation)
@@ -222,10 +222,10 @@ class Estimator:
             self._recent.append(estimate)
         return estimate
 
-    def _believed(self, observation: Observation) -> Observation:
+    def _believed(self, observation: Observation, last_ns: int) -> Observation:
         imu, shape = observation.imu, (*self.solver.view_shape, 3)
         return Observation(
-            timestamp_ns=checked_moment(observation.timestamp_ns, self._last_ns),
+            timestamp_ns=checked_moment(observation.timestamp_ns, last_ns),
             keypoints=believable_keypoints(
                 shaped_numbers(observation.keypoints, shape, "keypoints")
             ),
@@ -254,31 +254,33 @@ class Estimator:
         """The pose at an instant that pictures have not reached: from sensors, and as it goes on.
 
         `update` at that instant, or one before, corrects it; nothing else depends on it. None
-        before there is a motion to go on from.
+        before there is a motion to go on from. Raises `InputError` as `update` does.
         """
-        motion, now_ns = self._motion, observation.timestamp_ns
+        motion = self._motion
         if motion is None or self._solution is None or not motion.count:
             return None
         while self._coming and self._coming[0][0].timestamp_ns <= self._last_ns:
             self._coming.popleft()
         last = self._coming[-1] if self._coming else None
-        if now_ns <= (last[0].timestamp_ns if last else self._last_ns):
-            return None
+        observation = self._believed(observation, last[0].timestamp_ns if last else self._last_ns)
         self._coming.append((observation, last[1] if last else motion.pose()))
         if not motion.goes_on(self._coming[0][0].timestamp_ns):
             return None
         started = time.perf_counter()
         found = motion.ahead(self._coming, _MAX_STEPS)
+        if not np.isfinite(found.theta).all():
+            self._coming.clear()
+            return None
         for row, theta in enumerate(found.theta):
             self._coming[row] = (self._coming[row][0], theta)
         theta = found.theta[-1].copy()
-        if not np.isfinite(theta).all():
-            return None
         wrap_pose(theta)
         position, rotation = self.solver.posed(theta)
         bars = sigmas(found.turn_rad2, found.place_m2, self._turn_shares)
         return replace(
-            self._estimate(now_ns, self._solution, self._views, time.perf_counter() - started),
+            self._estimate(
+                observation.timestamp_ns, self._solution, self._views, time.perf_counter() - started
+            ),
             theta=theta,
             bone_position_in_world_m=position,
             bone_rotation_in_world=rotation,
@@ -311,6 +313,7 @@ class Estimator:
     def _begin_motion(self) -> None:
         """Forget how the person moved so far."""
         self._recent.clear()
+        self._coming.clear()
         if self._motion is not None:
             self._motion.reset()
 

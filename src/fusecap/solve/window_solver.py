@@ -200,12 +200,13 @@ class WindowSolver:
         Nobody is said to stand in them: only pictures, or more time, could tell.
         """
         kept, theta = self.count, self._theta[: self.count].copy()
-        for observation, start in coming:
-            self._append(observation, start)
-        self.refine(max_iterations)
-        found = Ahead(self._theta[kept : self.count].copy(), *self.newest_spread())
-        self.count, self._theta[:kept] = kept, theta
-        return found
+        try:
+            for observation, start in coming:
+                self._append(observation, start)
+            self.refine(max_iterations)
+            return Ahead(self._theta[kept : self.count].copy(), *self.newest_spread())
+        finally:
+            self.count, self._theta[:kept] = kept, theta
 
     def fold(self, leaving: int) -> None:
         """The oldest leave; what they say of the two after them stays, linearised here.

@@ -339,7 +339,7 @@ class LiveSettings(_Table):
     poses: Annotated[str, _one_of(POSES)] = "solved"
     """Which are sent: solved with the pictures that `delay_s` waits for, ahead of these by sensors
     and motion, or `settle_s` after they were solved."""
-    settle_s: Annotated[Positive, Field(le=1.0)] = 0.1
+    settle_s: Annotated[Positive, Field(le=0.3)] = 0.1
     """What comes so much later still corrects settled poses."""
     hold_s: NotNegative = 10.0
     """How long a person whom nothing measures is still sent, in the last pose and with growing

@@ -11,6 +11,7 @@ import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import median_high
 from typing import TypeVar
 
 import numpy as np
@@ -234,7 +235,7 @@ def _at_sensors_rate(session: Session, worn: Sequence[ImuTrack]) -> Session:
     rates_hz = [track.rate_hz for track in worn if np.isfinite(track.rate_hz)]
     if session.cameras or "rate_hz" in session.settings.model_fields_set or not rates_hz:
         return session
-    settings = session.settings.model_copy(update={"rate_hz": float(np.median(rates_hz))})
+    settings = session.settings.model_copy(update={"rate_hz": median_high(rates_hz)})
     return session.model_copy(update={"settings": settings})
 
 

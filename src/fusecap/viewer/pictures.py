@@ -60,16 +60,22 @@ class Pictures:
             self._samples[sample.camera] = sample
 
     def ready(self, step: LiveStep, colours: Mapping[str, Rgb]) -> list[int]:
-        """Draws what the step's instant has reached; which cameras have a new picture."""
-        new = []
+        """Draws what the last solved instant has reached; which cameras have a new picture.
+
+        With the people as sent, or as solved where those sent are of another instant.
+        """
+        new, seen_ns = [], step.detections.timestamp_ns
+        people = step.people.values()
+        if step.timestamp_ns != seen_ns:
+            people = step.step.estimates
+        poses = {one.name: pose_of(one) for one in people if one is not None}
         for row in range(len(self._rig)):
             image, sample = self._waiting[row], self._samples[row]
             exposed = image or sample
-            if exposed is None or exposed.timestamp_ns > step.timestamp_ns:
+            if exposed is None or exposed.timestamp_ns > seen_ns:
                 continue
             self._shown_ns[row] = exposed.timestamp_ns
             belongs = sample is not None and sample.timestamp_ns == exposed.timestamp_ns
-            poses = {name: pose_of(one) for name, one in step.people.items() if one is not None}
             self.draw(row, image, sample.people if sample and belongs else None, poses, colours)
             self._waiting[row] = self._samples[row] = None
             new.append(row)
