@@ -23,7 +23,6 @@ from fusecap.body.skeleton import EXTENDED23, PAPER21
 from fusecap.cli import app
 from fusecap.errors import InputError, TakeError
 from fusecap.evaluate.demo_scene import demo_scene
-from fusecap.exports.foot_events import foot_events, standing
 from fusecap.exports.formats import FORMATS, format_named
 from fusecap.exports.gltf import Gltf
 from fusecap.exports.gltf_people import add_body, add_joints
@@ -34,6 +33,7 @@ from fusecap.exports.rig_motion import rig_motion
 from fusecap.exports.rigs import PRESETS
 from fusecap.exports.take_files import export_all, export_take
 from fusecap.exports.take_format import ExportOptions
+from fusecap.feet import foot_events, standing
 from fusecap.sources.imu_files.formats.sto import FORMAT as STO
 from fusecap.take import save_take
 from motions import person, take_of, walk

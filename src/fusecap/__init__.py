@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from fusecap.body.skeleton import EXTENDED23 as EXTENDED23
     from fusecap.body.skeleton import PAPER21 as PAPER21
     from fusecap.body.skeleton import Skeleton as Skeleton
+    from fusecap.edits.edit import EditOptions as EditOptions
+    from fusecap.edits.edit import edit_take as edit_take
     from fusecap.errors import FusecapError as FusecapError
     from fusecap.exports.take_files import export as export
     from fusecap.geometry.camera import Camera as Camera

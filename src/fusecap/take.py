@@ -184,6 +184,30 @@ class Take:
             },
         )
 
+    def with_theta(
+        self,
+        theta: Float[np.ndarray, "s t p"],
+        *,
+        tracked: Bool[np.ndarray, "s t"] | None = None,
+        bone_sigma_deg: Float[np.ndarray, "s t b"] | None = None,
+        position_sigma_m: Float[np.ndarray, "s t b"] | None = None,
+    ) -> Take:
+        """The same people in other poses; what is not given stays."""
+        return take_from_theta(
+            theta,
+            [self.shape(row) for row in range(len(self.subject_names))],
+            timestamps_ns=self.timestamps_ns,
+            rate_hz=self.rate_hz,
+            subject_names=self.subject_names,
+            skeleton=self.skeleton,
+            tracked=self.tracked if tracked is None else tracked,
+            bone_sigma_deg=self.bone_sigma_deg if bone_sigma_deg is None else bone_sigma_deg,
+            position_sigma_m=(
+                self.position_sigma_m if position_sigma_m is None else position_sigma_m
+            ),
+            provenance=self.provenance,
+        )
+
     def shape(self, subject: int) -> BodyShape:
         """The body of one subject."""
         return BodyShape(

@@ -27,6 +27,7 @@ from fusecap.cli import (
     demo,
     detect,
     doctor,
+    edit,
     evaluate_datasets,
     evaluate_twin,
     export,
@@ -76,6 +77,7 @@ def _root(
 app.command(epilog=demo.EXAMPLE)(demo.demo)
 app.command(epilog=detect.EXAMPLE)(detect.detect)
 app.command(epilog=solve.EXAMPLE)(solve.solve)
+app.command(epilog=edit.EXAMPLE)(edit.edit)
 app.command(epilog=export.EXAMPLE)(export.export)
 app.command(epilog=doctor.EXAMPLE)(doctor.doctor)
 app.command(epilog=init.EXAMPLE)(init.init)

@@ -2,7 +2,7 @@
 
 Points are landmarks and joint centres, rotations the bones with their joints (a 4 x 4 per frame),
 in our world: y up, millimetres. A frame where the person is not tracked has residuals of -1. The
-EVENT group holds foot strikes and foot offs (`fusecap.exports.foot_events`).
+EVENT group holds foot strikes and foot offs (`fusecap.feet`).
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from fusecap.exports.foot_events import foot_events
 from fusecap.exports.library import missing, written_by_name
 from fusecap.exports.markers import marker_positions_m
 from fusecap.exports.take_format import UNITS_PER_M, ExportOptions, TakeFormat
+from fusecap.feet import foot_events
 from fusecap.files import safe_name
 from fusecap.take import Take
 

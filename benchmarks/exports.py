@@ -1,0 +1,81 @@
+"""How long exports take and how big they are: two people who walk, at 60 Hz.
+
+    uv run --frozen python benchmarks/exports.py --minutes 30 [--formats glb,csv]
+
+The motion is made up (simulated), every joint moves. Prints seconds, megabytes and the peak memory
+of each format, each in a process of its own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import resource
+import sys
+import tempfile
+import time
+
+import numpy as np
+
+from fusecap.body.shape import BodyShape
+from fusecap.body.skeleton import PAPER21
+from fusecap.evaluate.demo_scene import demo_scene
+from fusecap.exports.formats import FORMATS
+from fusecap.exports.take_files import export_take
+from fusecap.exports.take_format import ExportOptions
+from fusecap.take import Take, take_from_theta
+
+
+def long_take(minutes: float, rate_hz: float = 60.0) -> Take:
+    frames = round(minutes * 60 * rate_hz)
+    time_s = np.arange(frames) / rate_hz
+    shapes = [BodyShape.from_height(PAPER21, height) for height in (1.65, 1.85)]
+    rng = np.random.default_rng(0)
+    theta = np.empty((2, frames, PAPER21.pose_size))
+    for person, shape in enumerate(shapes):
+        size, speed, phase = rng.uniform(0.1, 1.0, (3, PAPER21.pose_size))
+        theta[person] = 0.5 * size * np.sin(6 * speed * time_s[:, None] + 6 * phase)
+        theta[person, :, 1] = shape.standing_root_height_m
+    return take_from_theta(
+        theta,
+        shapes,
+        timestamps_ns=np.round(time_s * 1e9).astype(np.int64),
+        rate_hz=rate_hz,
+        subject_names=("anna", "ben"),
+        skeleton=PAPER21,
+        provenance={"simulated": True},
+    )
+
+
+def measure(name: str, minutes: float) -> None:
+    take = long_take(minutes)
+    options = ExportOptions()
+    if name == "openpose":
+        options = ExportOptions(cameras=demo_scene(0, seconds=0.1).rig)
+    with tempfile.TemporaryDirectory() as folder:
+        began = time.perf_counter()
+        paths = export_take(take, folder, format=name, stem="t", options=options)
+        took_s = time.perf_counter() - began
+        files = [f for path in paths for f in (path.rglob("*") if path.is_dir() else [path])]
+        size_mb = sum(f.stat().st_size for f in files if f.is_file()) / 1e6
+    memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(f"{name:9} {took_s:7.1f} s {size_mb:8.1f} MB {memory_mb:8.0f} MB memory", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--minutes", type=float, default=30.0)
+    parser.add_argument("--formats", default=",".join(FORMATS))
+    told = parser.parse_args()
+    for name in told.formats.split(","):
+        child = multiprocessing.get_context("spawn").Process(
+            target=measure, args=(name, told.minutes)
+        )
+        child.start()
+        child.join()
+        if child.exitcode:
+            print(f"{name:9} failed", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()
