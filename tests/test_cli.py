@@ -113,7 +113,7 @@ def test_doctor_finds_nothing_wrong_with_a_good_session(session):
     [
         (("solve", "nowhere"), 1, "nowhere"),
         (("solve",), 2, "Missing argument"),
-        (("solve", ".", "--export", "fbx"), 2, "fbx"),
+        (("solve", ".", "--export", "obj"), 2, "obj"),
         (("demo", "--associate", "papr"), 2, "did you mean 'paper'"),
         (("demo", "--seconds", "1000"), 1, "1000 s asked for"),
         (("export", "nowhere.npz"), 1, "nowhere.npz"),
