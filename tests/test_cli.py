@@ -137,16 +137,26 @@ def test_with_json_a_failure_is_json_too(tmp_path):
 
 
 @pytest.mark.parametrize("stage", ["sorting", "solving"])
-def test_ctrl_c_leaves_a_valid_take_of_what_was_solved(session, tmp_path, stage):
+def test_ctrl_c_leaves_a_valid_take_of_what_was_solved_beside_the_whole_one(
+    session, tmp_path, stage
+):
     script = tmp_path / "interrupted.py"
     script.write_text(_INTERRUPTED_SOLVE)
     out = tmp_path / "take.npz"
+    out.write_bytes(b"a whole take")
+    (tmp_path / "take_anna.bvh").write_bytes(b"a whole export")
     command = [sys.executable, script, stage, "solve", session, "--out", out, "--json"]
+    command += ["--export", "bvh"]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 130, result.stderr
     assert json.loads(result.stdout)["interrupted"] is True
     assert "interrupted" in result.stderr
-    take = load_take(out)
+    assert out.read_bytes() == b"a whole take"
+    assert (tmp_path / "take_anna.bvh").read_bytes() == b"a whole export"
+    files = [Path(file).name for file in json.loads(result.stdout)["files"]]
+    assert files[0] == "take-interrupted.npz"
+    assert all(name.startswith("take-interrupted") for name in files)
+    take = load_take(tmp_path / "take-interrupted.npz")
     assert 50 <= len(take.timestamps_ns) < 120
     assert take.tracked.any()
 

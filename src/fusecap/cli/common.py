@@ -19,7 +19,6 @@ from fusecap.files import plain
 if TYPE_CHECKING:
     from fusecap.batch.solve import Solved
     from fusecap.exports.take_format import ExportOptions
-    from fusecap.take import Take
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object for machines.")]
 Unit = Annotated[
@@ -79,11 +78,17 @@ class Exports:
     options: ExportOptions | None = None
 
 
-def write_take(take: Take, path: Path, exports: Exports, *, picture: bool) -> list[Path]:
-    """The take, its exports and its picture; exports of a take that stood there are set aside."""
+def write_take(solved: Solved, path: Path, exports: Exports, *, picture: bool) -> list[Path]:
+    """The take, its exports and its picture; exports of a take that stood there are set aside.
+
+    What an interrupted solve has goes beside `path`, by names of its own: a whole take stays.
+    """
     from fusecap.exports.take_files import export_all, set_aside
     from fusecap.take import load_take, save_take
 
+    take = solved.take
+    if solved.report.interrupted:
+        path = path.with_name(f"{path.stem}-interrupted{path.suffix}")
     try:
         earlier = load_take(path).subject_names
     except TakeError:
@@ -117,7 +122,10 @@ def finish(solved: Solved, files: list[Path], as_json: bool) -> None:
     if not as_json:
         wrote(*files)
     if solved.report.interrupted:
-        err.print("interrupted: the files hold what was solved until then")
+        err.print(
+            "interrupted: these files hold what was solved until then; what was solved before "
+            "stays where it is"
+        )
         raise typer.Exit(130)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
@@ -94,10 +94,10 @@ def solve(
     with progress(quiet=as_json) as show:
         data = open_session(loaded, show)
         solved = solve_session(data, progress=show)
-    if not solved.take.tracked.any() and not solved.report.interrupted:
-        raise InputError(_nobody(solved.report))
+    if not solved.take.tracked.any():
+        _stop_without_poses(solved, _nobody(solved.report))
     seen = ExportOptions(cameras=data.rig, landmarks=data.landmarks)
-    files = write_take(solved.take, target, replace(exports, options=seen), picture=picture)
+    files = write_take(solved, target, replace(exports, options=seen), picture=picture)
     detection = {} if detected is None else {"detection": detected.as_json()}
     _print_solved(solved, files, detection, as_json)
 
@@ -125,12 +125,13 @@ def _solve_recording(
             replay = {"replay": {"poses": again.poses, "equal": again.equal}}
         else:
             solved = solve_recording(recording, progress=show)
-    if not solved.take.tracked.any() and not solved.report.interrupted:
-        raise InputError(
+    if not solved.take.tracked.any():
+        _stop_without_poses(
+            solved,
             f"nobody could be followed in {solved.report.instants} instants of {path}; nothing "
-            f"was written. What is in it: fusecap doctor {path}"
+            f"was written. What is in it: fusecap doctor {path}",
         )
-    files = write_take(solved.take, target, exports, picture=picture)
+    files = write_take(solved, target, exports, picture=picture)
     _print_solved(solved, files, replay, quiet)
 
 
@@ -148,6 +149,13 @@ def _print_solved(solved: Solved, files: list[Path], more: dict[str, Any], as_js
             note(text)
         _print_report(solved)
     finish(solved, files, as_json)
+
+
+def _stop_without_poses(solved: Solved, why: str) -> NoReturn:
+    """Nothing is written: it was interrupted too early, or nobody could be followed."""
+    if solved.report.interrupted:
+        raise KeyboardInterrupt
+    raise InputError(why)
 
 
 def _nobody(report: SolveReport) -> str:
