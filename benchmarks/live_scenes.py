@@ -236,4 +236,6 @@ def reading_client(url: str) -> Iterator[None]:
 
 def send_to(run: LiveRun, targets: Sequence[Target]) -> None:
     """Streams of a run, in a process of their own."""
-    run.add_listener(Streaming(targets, run.setup, run.rate_hz, run.clock, run.latency))
+    run.add_listener(
+        Streaming(targets, run.setup, run.rate_hz, run.clock, run.latency, run.incidents.add)
+    )

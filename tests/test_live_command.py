@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -56,8 +57,10 @@ def test_a_recording_played_as_if_live_is_solved_recorded_and_reported(session, 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("signals", [1, 2])
-def test_ctrl_c_ends_a_run_with_success_and_a_whole_recording(session, tmp_path, signals):
+@pytest.mark.parametrize(
+    ("number", "signals"), [(signal.SIGINT, 1), (signal.SIGINT, 2), (signal.SIGHUP, 1)]
+)
+def test_a_signal_ends_a_run_with_success_and_a_whole_recording(session, tmp_path, number, signals):
     from fusecap.recording.reader import Recording
 
     recording = tmp_path / "run.mcap"
@@ -72,7 +75,7 @@ def test_ctrl_c_ends_a_run_with_success_and_a_whole_recording(session, tmp_path,
         while not (recording.is_file() and recording.stat().st_size > 20_000):
             assert running.poll() is None, running.communicate()[1]
         for _ in range(signals):
-            running.send_signal(signal.SIGINT)
+            running.send_signal(number)
         out, error = running.communicate(timeout=60)
     # A second signal that comes when all is written may find Python itself already leaving.
     assert running.returncode == 0 or (signals == 2 and running.returncode == -signal.SIGINT), error
@@ -80,6 +83,62 @@ def test_ctrl_c_ends_a_run_with_success_and_a_whole_recording(session, tmp_path,
     read = Recording(recording)
     assert list(read.items())
     assert read.loss.finished and read.loss.whole
+
+
+@pytest.mark.slow
+def test_a_killed_stream_process_is_an_incident_and_is_started_again(session):
+    def children(pid: int) -> list[int]:
+        return [
+            int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+        ]
+
+    arguments = [session, "--playback", "--loop", "--no-record", "--seconds", 8, "--json"]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        receiver.settimeout(60)
+        arguments += ["--to", f"osc://127.0.0.1:{receiver.getsockname()[1]}"]
+        with subprocess.Popen(
+            [sys.executable, "-m", "fusecap", "live", *map(str, arguments)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        ) as running:
+            receiver.recv(65536)
+            for child in children(running.pid):
+                os.kill(child, signal.SIGKILL)
+            out, error = running.communicate(timeout=60)
+    assert running.returncode == 0 and error == ""
+    told = [incident["what"] for incident in json.loads(out)["incidents"]]
+    assert any("killed by signal 9" in what for what in told), told
+    assert "streams: sent again" in told
+
+
+@pytest.mark.slow
+def test_a_run_that_ends_without_streams_fails(session, tmp_path):
+    script = tmp_path / "down.py"
+    script.write_text(
+        "import fusecap.live.streaming as s\n"
+        "s.Streaming.down = property(lambda self: True)\n"
+        "from fusecap.cli import main\nmain()\n"
+    )
+    command = [sys.executable, script, "live", session, "--playback", "--no-record"]
+    command += ["--seconds", 1, "--to", "osc"]
+    done = subprocess.run([*map(str, command)], capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and "streams were not sent" in done.stderr
+
+
+@pytest.mark.slow
+def test_a_refused_port_leaves_no_recording(session, tmp_path):
+    folder = tmp_path / "own"
+    shutil.copytree(session if session.is_dir() else session.parent, folder)
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        for option in (["--view", "--view-port", port], ["--to", f"ws://127.0.0.1:{port}"]):
+            done = fusecap(folder, "--playback", "--seconds", 1, *option)
+            assert done.returncode == 1 and str(port) in done.stderr
+    assert not list(folder.rglob("*.mcap"))
 
 
 @pytest.mark.slow

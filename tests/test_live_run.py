@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fusecap.errors import SessionError
+from fusecap.errors import InputError, SessionError
 from fusecap.live.devices.source import SessionClock, SourceLost
 from fusecap.live.health import Incidents, Input, Meter
 from fusecap.live.inbox import Inbox
@@ -491,6 +491,17 @@ def test_recordings_begin_and_end_in_mid_run(tmp_path):
     assert going.report is not None
     assert [r.path for r in going.report.recordings] == [str(first.path), str(second.path)]
     assert not any(recording.problem for recording in going.report.recordings)
+
+
+def test_recordings_of_one_name_get_numbers(tmp_path):
+    runs = [make_run(engine=FakeEngine()) for _ in range(3)]
+    switches = [RecordSwitch(run, lambda: tmp_path / "a.mcap", images=False) for run in runs]
+    paths = [switch.begin() for switch in switches]
+    for run in runs:
+        run.close()
+    assert [path.name for path in paths] == ["a.mcap", "a-2.mcap", "a-3.mcap"]
+    with pytest.raises(InputError, match="exists; choose another name"):
+        switches[0].begin(paths[0])
 
 
 def test_status_comes_once_a_second_and_the_report_is_plain():

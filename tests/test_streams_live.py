@@ -22,6 +22,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from fusecap.errors import InputError, TakeError
+from fusecap.streams.door import Door
 from fusecap.streams.play_take import TakePlayer, play
 from fusecap.streams.protocols.ws import WebSocketStream
 from fusecap.streams.stream import open_stream
@@ -304,7 +305,7 @@ def test_host_that_is_none_is_named(host):
     with pytest.raises(InputError, match=f"cannot send to {re.escape(host)}:9000"):
         UdpSender(host, 9000, Counts())
     with pytest.raises(InputError, match=f"ws://{re.escape(host)}:9000: the port cannot be opened"):
-        WebSocketServer(host, 9000, Counts())
+        WebSocketServer(host, 9000, Counts(), Door(token=""))
 
 
 def test_people_beyond_the_last_port_are_refused(take):
@@ -368,7 +369,7 @@ def test_websocket_without_clients_says_where_to_connect(served):
 def test_stalled_client_loses_its_oldest_frames_and_holds_nobody():
     counts = Counts()
     port = free_port()
-    server = WebSocketServer(HOST, port, counts)
+    server = WebSocketServer(HOST, port, counts, Door(token=""))
     with socket.create_connection((HOST, port)) as stalled:
         stalled.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         stalled.sendall(HANDSHAKE)
@@ -397,7 +398,7 @@ def test_stalled_client_loses_its_oldest_frames_and_holds_nobody():
 def test_client_that_lies_behind_gets_the_newest_frames_once_it_reads_again():
     counts = Counts()
     port = free_port()
-    server = WebSocketServer(HOST, port, counts)
+    server = WebSocketServer(HOST, port, counts, Door(token=""))
     with socket.create_connection((HOST, port)) as client:
         client.sendall(HANDSHAKE)
         client.recv(20)
@@ -432,7 +433,7 @@ def test_port_in_use_is_said():
         other.listen()
         port = other.getsockname()[1]
         with pytest.raises(InputError, match=rf"ws://127.0.0.1:{port}: the port is in use"):
-            WebSocketServer(HOST, port, Counts())
+            WebSocketServer(HOST, port, Counts(), Door(token=""))
 
 
 # LSL

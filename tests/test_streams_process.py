@@ -51,11 +51,13 @@ def receiver() -> Iterator[socket.socket]:
         yield one
 
 
-def streams_to(*targets: Target, latency: LatencyBook | None = None) -> StreamProcess:
-    cast = {"anna": SHAPE}
-    return StreamProcess(
-        targets, cast, 60.0, SessionClock().now_ns, (latency or LatencyBook()).sent
-    )
+def streams_to(
+    *targets: Target,
+    latency: LatencyBook | None = None,
+    report: Callable[[str], None] = lambda text: None,
+) -> StreamProcess:
+    cast, sent = {"anna": SHAPE}, (latency or LatencyBook()).sent
+    return StreamProcess(targets, cast, 60.0, SessionClock().now_ns, sent, report)
 
 
 def livelink(receiver: socket.socket) -> Target:
@@ -83,7 +85,7 @@ def test_every_instant_is_sent_reported_and_timed(receiver):
     times = {stage.stage: stage.count for stage in latency.total()}
     assert times[EXPOSURE_TO_PACKET] == 10
     streams.close()
-    assert streams._process.returncode == 0
+    assert streams._child.end() == 0
 
 
 @pytest.mark.slow
@@ -97,10 +99,10 @@ def test_instants_before_the_end_are_sent_and_the_last_report_comes(receiver):
 @pytest.mark.slow
 def test_child_that_lies_behind_loses_the_oldest_instants_and_sends_the_newest(receiver):
     streams = streams_to(livelink(receiver))
-    os.kill(streams._process.pid, signal.SIGSTOP)
+    os.kill(streams._child.pid, signal.SIGSTOP)
     for number in range(1, 101):
         send(streams, number, 0.01 * number)
-    os.kill(streams._process.pid, signal.SIGCONT)
+    os.kill(streams._child.pid, signal.SIGCONT)
     streams.close()
     sent_cm = [
         round(json.loads(receiver.recv(8192))["anna"][0]["Location"][0])
@@ -121,11 +123,32 @@ def test_address_that_cannot_be_had_is_refused_as_without_a_process():
 
 
 @pytest.mark.slow
-def test_killed_process_is_told_of_and_holds_up_nobody(receiver):
-    streams = streams_to(livelink(receiver), livelink(receiver))
-    os.kill(streams._process.pid, signal.SIGKILL)
+def test_killed_process_is_told_of_holds_up_nobody_and_is_started_again(receiver):
+    told: list[str] = []
+    streams = streams_to(livelink(receiver), livelink(receiver), report=told.append)
+    send(streams, 1, 0.0)
+    until(lambda: streams.poses == (1, 1))
+    os.kill(streams._child.pid, signal.SIGKILL)
     until(lambda: streams.gone)
-    for number in range(100):
+    for number in range(2, 102):
         send(streams, number, 0.0)
     assert "process has ended" in streams.statuses()[1].remark
+    until(lambda: not streams.gone)
+    assert "killed by signal 9" in told[0] and told[-1] == "streams: sent again"
+    send(streams, 102, 0.25)
+    until(lambda: streams.poses[0] > 1)
     streams.close()
+    status = streams.statuses()[0]
+    assert status.sent == streams.poses[0] and status.sent + status.dropped == 102
+    assert status.remark == ""
+
+
+@pytest.mark.slow
+def test_process_that_is_closed_while_it_is_gone_ends_at_once(receiver):
+    streams = streams_to(livelink(receiver))
+    os.kill(streams._child.pid, signal.SIGKILL)
+    until(lambda: streams.gone)
+    started_s = time.monotonic()
+    streams.close()
+    assert time.monotonic() - started_s < 3.0
+    assert not any(thread.is_alive() for thread in streams._threads)

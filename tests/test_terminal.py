@@ -69,6 +69,22 @@ def test_progress_and_tables_show_brackets():
     assert "[session]" in shown.get() and "[bold]x" in shown.get()
 
 
+def test_what_a_terminal_would_obey_is_shown_by_its_number():
+    hostile = "a\x1b[2J\x1b]0;title\x07\r\u202egnp.exe\udcff\x9b1m"
+    told = "a\\x1b[2J\\x1b]0;title\\x07\\r\\u202egnp.exe\\udcff\\x9b1m"
+    with terminal.err.capture() as shown:
+        terminal.note(hostile)
+        terminal.err.print(hostile)
+    assert shown.get() == f"note {told}\n{told}\n"
+    table = terminal.table_of("name")
+    table.add_row(hostile)
+    with terminal.console.capture() as shown:
+        terminal.console.print(table)
+        terminal.wrote(f"/tmp/{hostile}.npz")
+    assert shown.get().count(told) == 2 and "\x1b" not in shown.get()
+    assert terminal.shown("zwei\nZeilen\tüber 人 👩‍👩‍👧") == "zwei\nZeilen\tüber 人 👩‍👩‍👧"
+
+
 def test_only_one_room_of_the_commands_knows_rich():
     package = Path(fusecap.cli.__file__).parents[1]
     for path in package.rglob("*.py"):

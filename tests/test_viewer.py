@@ -386,7 +386,7 @@ def test_an_address_of_another_machine_is_refused_with_words():
 
 def test_an_open_page_says_so():
     with page_of(host="0.0.0.0", port=free_port()) as page:
-        assert page.is_open and "no password" in (note_if_open(page) or "")
+        assert page.is_open and "open to other machines" in (note_if_open(page) or "")
 
 
 def test_only_pages_served_here_may_connect():

@@ -151,8 +151,8 @@ def live(
     try:
         streaming = _add_streams(run, targets)
         switch = RecordSwitch(run, partial(recording_path, loaded), images=record_images)
-        path = None if no_record else switch.begin(record)
         page = _add_viewer(run, switch, host, view_port) if view else None
+        path = None if no_record else switch.begin(record)  # last: a refused port leaves no file
     except BaseException:
         run.close()
         raise
@@ -169,6 +169,8 @@ def live(
             print_json({**report.as_json(), "missing": missing})
         else:
             print_report(report)
+    if streaming is not None and streaming.down:
+        raise InputError("streams were not sent at the end of the run: see its incidents")
 
 
 def _playback(
@@ -218,7 +220,9 @@ def _add_streams(run: LiveRun, targets: Sequence[Target]) -> Streaming | None:
         return None
     from fusecap.live.streaming import Streaming
 
-    streaming = Streaming(targets, run.setup, run.rate_hz, run.clock, run.latency)
+    streaming = Streaming(
+        targets, run.setup, run.rate_hz, run.clock, run.latency, run.incidents.add
+    )
     run.add_listener(streaming)
     return streaming
 
@@ -276,14 +280,16 @@ def _announce(
 
 @contextmanager
 def _until_interrupted(run: LiveRun, *, quiet: bool) -> Iterator[None]:
-    """Ctrl-C and SIGTERM end the run; a second one does not cut its end short."""
+    """Ctrl-C, SIGTERM and SIGHUP end the run; a second one does not cut its end short."""
 
     def end(number: int, frame: object) -> None:
         run.stop()
         if not quiet:
             err.print("ending: closing devices, streams and the recording")
 
-    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    names = ("SIGINT", "SIGTERM", "SIGHUP")  # Windows knows no SIGHUP
+    numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
+    before = {number: signal.signal(number, end) for number in numbers}
     try:
         yield
     finally:

@@ -26,13 +26,16 @@ def placed_targets(
 
     `other_servers` says that the command serves something else there as well. Raises `InputError`.
     """
-    from fusecap.streams.target import is_loopback, parse_target, serves
+    from fusecap.streams.door import is_loopback, new_token
+    from fusecap.streams.target import parse_target, serves
 
     targets = [parse_target(text) for text in to]
     if host is not None and not other_servers and not any(map(serves, targets)):
         raise InputError("--host is the address on which ws serves clients; add --to ws")
     placed = [
-        replace(target, host=host) if host is not None and serves(target) else target
+        replace(target, host=host, token=new_token(host))
+        if host is not None and serves(target)
+        else target
         for target in targets
     ]
     for target in placed:
@@ -51,10 +54,8 @@ def placed_targets(
 
 def warn_if_open(target: Target) -> None:
     """Say so where other machines can connect."""
-    from fusecap.streams.target import is_loopback, serves
-
-    if serves(target) and not is_loopback(target.host):
+    if target.token:
         note(
-            f"{target} is open: whoever reaches this machine on port "
-            f"{target.port} can follow the motion; there is no password and no encryption"
+            f"{target} is open to other machines: whoever has the address with its token can "
+            f"follow the motion; it is {target.address}, new each time, and nothing is encrypted"
         )

@@ -1,11 +1,13 @@
 """What the terminal shows: the only commands' room that knows rich.
 
 No text is read as markup, so names, paths and `[session]` are shown as they are; what has a colour
-says so with `styled`.
+says so with `styled`. Characters that would move the cursor, colour the screen, turn the direction
+of writing, or that no terminal can show, are shown by their numbers.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -20,15 +22,30 @@ if TYPE_CHECKING:
 
     from fusecap.progress import Progress
 
-err = Console(stderr=True, highlight=False, emoji=False, markup=False)
-console = Console(highlight=False, emoji=False, markup=False)
+_UNSHOWN = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+
+
+def shown(text: str) -> str:
+    """The text with `\\x1b` and the like in place of what a terminal would obey or choke on."""
+    return _UNSHOWN.sub(lambda found: found[0].encode("unicode_escape").decode("ascii"), text)
+    """The text with the numbers of characters that a terminal would obey or choke on."""
+
+class _TextConsole(Console):
+    def render_str(self, text: str, **options: Any) -> Text:
+        return super().render_str(shown(text), **options)
+
+
+err = _TextConsole(stderr=True, highlight=False, emoji=False, markup=False)
+console = _TextConsole(highlight=False, emoji=False, markup=False)
 
 
 def styled(*parts: str | tuple[str, str]) -> Text:
     """Strings one after the other, those with a style as (string, style)."""
     from rich.text import Text
 
-    return Text.assemble(*parts)
+    return Text.assemble(
+        *((shown(part) if isinstance(part, str) else (shown(part[0]), part[1])) for part in parts)
+    )
 
 
 def note(text: str) -> None:
@@ -79,7 +96,7 @@ def progress(*, quiet: bool, rate: bool = False) -> Iterator[Progress]:
 
         def show(what: str, done: int, total: int) -> None:
             if what not in tasks:
-                tasks[what] = bars.add_task(what, total=total)
+                tasks[what] = bars.add_task(shown(what), total=total)
             bars.update(tasks[what], completed=done, total=total)
 
         yield show

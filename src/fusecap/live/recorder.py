@@ -247,16 +247,30 @@ class RecordSwitch:
         """
         with self._lock:
             self._end()
-            self._recorder = Recorder(
-                path or self._next_path(),
-                self._run.setup,
-                self._run.clock,
-                from_start=not self._run.begun,
-                images=self._images,
-                report=self._run.incidents.add,
-            )
+            self._recorder = self._to(path) if path else self._to_next()
             self._run.add_listener(self._recorder)
             return self._recorder.path
+
+    def _to(self, path: Path) -> Recorder:
+        return Recorder(
+            path,
+            self._run.setup,
+            self._run.clock,
+            from_start=not self._run.begun,
+            images=self._images,
+            report=self._run.incidents.add,
+        )
+
+    def _to_next(self) -> Recorder:
+        """By the usual name, with a number where another run has taken it."""
+        usual = self._next_path()
+        path, number = usual, 1
+        while True:
+            try:
+                return self._to(path)
+            except _NameTaken:
+                number += 1
+                path = usual.with_stem(f"{usual.stem}-{number}")
 
     def turn(self, on: bool) -> None:
         """As a button does: begin another recording, or end the one that goes on."""
@@ -272,9 +286,11 @@ class RecordSwitch:
             self._run.remove_listener(recorder)
 
 
+class _NameTaken(InputError):
+    """There is such a file already."""
+
+
 def _new_file(path: Path) -> BinaryIO:
-    if path.exists():
-        raise InputError(f"{path} exists; choose another name for the recording")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         free = shutil.disk_usage(path.parent).free
@@ -284,6 +300,8 @@ def _new_file(path: Path) -> BinaryIO:
                 f"{MIN_FREE_BYTES / 1e6:.0f} or more; make room or choose another folder"
             )
         return path.open("xb")
+    except FileExistsError:
+        raise _NameTaken(f"{path} exists; choose another name for the recording") from None
     except OSError as error:
         raise InputError(f"cannot write {path}: {error.strerror or error}") from None
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from fusecap.body.shape import REFERENCE_HEIGHT_M, BodyShape
 from fusecap.engine.engine import LiveStep
@@ -39,10 +39,11 @@ class Streaming:
         rate_hz: float,
         clock: SessionClock,
         latency: LatencyBook,
+        report: Callable[[str], None],
     ) -> None:
-        """Raises `InputError` where a stream cannot be opened."""
+        """`report` hears of trouble. Raises `InputError` where a stream cannot be opened."""
         self._process = StreamProcess(
-            targets, first_cast(setup), rate_hz, clock.now_ns, latency.sent
+            targets, first_cast(setup), rate_hz, clock.now_ns, latency.sent, report
         )
 
     @property
@@ -54,6 +55,11 @@ class Streaming:
                 self._process.addresses, self._process.statuses(), strict=True
             )
         )
+
+    @property
+    def down(self) -> bool:
+        """Nothing is sent now: the process has ended, and none has taken its place yet."""
+        return self._process.gone
 
     @property
     def poses(self) -> float:

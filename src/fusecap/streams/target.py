@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import ipaddress
-from dataclasses import dataclass
+import socket
+from dataclasses import dataclass, replace
 from urllib.parse import urlsplit
 
 from fusecap.errors import InputError, nearest
@@ -19,6 +19,15 @@ class Target:
     protocol: str
     host: str = ""
     port: int = 0
+    token: str = ""
+    """That clients of a server beyond loopback need."""
+
+    @property
+    def address(self) -> str:
+        """Where clients find it: with its token, and by this machine's name where it has many."""
+        host = socket.gethostname() if self.host in ("0.0.0.0", "::") else self.host
+        address = str(replace(self, host=host))
+        return f"{address}/?token={self.token}" if self.token else address
 
     def __str__(self) -> str:
         if not self.host:
@@ -62,13 +71,3 @@ def parse_target(text: str) -> Target:
 def serves(target: Target) -> bool:
     """Whether receivers connect to it, rather than being sent to."""
     return protocol_named(target.protocol).serves
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only programs of this machine can reach `host`."""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False

@@ -15,15 +15,21 @@ import socket
 import threading
 from collections import deque
 from dataclasses import dataclass
+from http import HTTPStatus
 from typing import TYPE_CHECKING
+from urllib.parse import parse_qs, urlsplit
 
 from fusecap.errors import InputError
+from fusecap.streams.door import Door
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
+    from websockets.http11 import Request, Response
 
 CLIENT_QUEUE = 4
 """Messages a WebSocket client may lie behind."""
+_MOST_HEARD_BYTES = 1024
+"""Of a message from a client; none is read."""
 _GOODBYE_S = 0.5
 """How long the server lets clients take what is queued when it closes."""
 _LOG = logging.getLogger("fusecap.websocket")
@@ -107,12 +113,13 @@ class _Client:
 class WebSocketServer:
     """Serves messages to any number of clients from a thread of its own.
 
-    Clients of `/binary` get binary frames, all others text. Raises `InputError` where the port
-    cannot be had.
+    Clients of `/binary` get binary frames, all others text; the `door` says who is one. Raises
+    `InputError` where the port cannot be had.
     """
 
-    def __init__(self, host: str, port: int, counts: Counts) -> None:
+    def __init__(self, host: str, port: int, counts: Counts, door: Door) -> None:
         self.clients_ever = 0
+        self._door = door
         self._counts = counts
         self._clients: set[_Client] = set()
         self._cast: str | None = None
@@ -179,6 +186,9 @@ class WebSocketServer:
             compression=None,
             close_timeout=_GOODBYE_S,
             logger=_LOG,
+            max_size=_MOST_HEARD_BYTES,
+            max_queue=1,
+            process_request=self._admit,
         )
         async with server:
             self._ready.set()
@@ -189,6 +199,15 @@ class WebSocketServer:
             for client in tuple(self._clients):
                 if client.busy:
                     client.connection.transport.abort()
+
+    def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
+        headers = request.headers
+        refusal = self._door.refusal(
+            token=parse_qs(urlsplit(request.path).query).get("token", [""])[0],
+            host=", ".join(headers.get_all("Host")),
+            origin=", ".join(headers.get_all("Origin")) or None,
+        )
+        return connection.respond(HTTPStatus.FORBIDDEN, f"{refusal}\n") if refusal else None
 
     async def _attend(self, connection: ServerConnection) -> None:
         from websockets.exceptions import ConnectionClosed

@@ -2,27 +2,37 @@
 
 Served to this machine alone unless told otherwise. A browser lets any web site open a connection to
 this machine, and a viewer shows people; so connections that another site's page opens are refused,
-and viser's public links are off.
+and viser's public links are off. A page that other machines can reach has a random name, and only
+who knows it gets the page or its socket: viser's page connects to the address that it came from.
 """
 
 from __future__ import annotations
 
+import atexit
 import errno
+import logging
+import shutil
 import socket
-from contextlib import suppress
-from urllib.parse import urlsplit
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
 
 import rich
 import viser
+from viser import infra
 from viser.infra import WebsockClientConnection
 from websockets.asyncio.server import ServerConnection
 
 from fusecap.errors import InputError
-from fusecap.streams.target import LOOPBACK, is_loopback
+from fusecap.streams.door import Door, new_token
+from fusecap.streams.target import LOOPBACK
 
 DEFAULT_PORT = 8080
 _PORTS_TRIED = 20
 _PANEL_WIDTH_PX = 360
+_LIBRARIES = ("websockets.server", "asyncio")
 
 
 class Page(viser.ViserServer):
@@ -35,9 +45,14 @@ class Page(viser.ViserServer):
         """
         chosen = _free_port(host) if port is None else _checked_port(host, port)
         rich.get_console().quiet = True  # viser's own messages; fusecap's consoles are others
-        super().__init__(host=host, port=chosen, label=title, verbose=False)
-        self.address = f"http://{_in_url(host)}:{self.get_port()}"
-        self.is_open = not is_loopback(host)
+        for library in _LIBRARIES:  # what they say about ill-mannered clients
+            logging.getLogger(library).addHandler(logging.NullHandler())
+        self._door = Door(token=new_token(host))
+        name = f"{self._door.token}.html" if self._door.token else ""
+        with _served_as(name):
+            super().__init__(host=host, port=chosen, label=title, verbose=False)
+        self.address = f"http://{_in_url(host)}:{self.get_port()}/{name}".rstrip("/")
+        self.is_open = bool(self._door.token)
         """Whether other machines can reach it."""
         self._websock_server.on_client_connect(self._refuse_other_sites)
         self.scene.set_up_direction("+y")
@@ -51,8 +66,9 @@ class Page(viser.ViserServer):
 
     async def _refuse_other_sites(self, client: WebsockClientConnection) -> None:
         connection = self._websock_server._live_connections[client.client_id]
-        if not _same_site(connection, only_loopback=not self.is_open):
-            await connection.close(1008, "opened by another site")
+        refusal = _refusal(connection, self._door)
+        if refusal:
+            await connection.close(1008, refusal)
 
 
 def note_if_open(page: Page) -> str | None:
@@ -60,20 +76,44 @@ def note_if_open(page: Page) -> str | None:
     if not page.is_open:
         return None
     return (
-        f"{page.address} is open: whoever reaches this machine on port {page.get_port()} can watch "
-        "and press every button; there is no password and no encryption"
+        f"{page.address} is open to other machines, with {socket.gethostname()} in place of "
+        "localhost: whoever has the address can watch and press every button; it is new each time, "
+        "and nothing is encrypted"
     )
 
 
-def _same_site(connection: ServerConnection, *, only_loopback: bool) -> bool:
-    """Whether the page that connects was served here; programs that name no origin may connect."""
+def _refusal(connection: ServerConnection, door: Door) -> str:
+    """Empty for the page that was served here, and for programs, which name no origin."""
     if connection.request is None:
-        return False
-    host = connection.request.headers.get("Host", "")
-    origin = connection.request.headers.get("Origin")
-    if only_loopback and not is_loopback(urlsplit(f"//{host}").hostname or ""):
-        return False
-    return origin is None or urlsplit(origin).netloc == host
+        return "nothing was asked for"
+    headers = connection.request.headers
+    host, origin = ", ".join(headers.get_all("Host")), ", ".join(headers.get_all("Origin")) or None
+    if origin is not None and origin.partition("://")[2] != host:
+        return "opened by another site"
+    name = connection.request.path.partition("?")[0].strip("/")
+    return door.refusal(token=name.removesuffix(".html"), host=host, origin=origin)
+
+
+@contextmanager
+def _served_as(name: str) -> Iterator[None]:
+    """A viser server that is made meanwhile serves its page by this name alone."""
+    if not name:
+        yield
+        return
+    usual = infra.WebsockServer
+    folder = tempfile.mkdtemp(prefix="fusecap-page-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+
+    class Named(usual):
+        def __init__(self, *args: Any, http_server_root: Path, **options: Any) -> None:
+            shutil.copy(http_server_root / "index.html", Path(folder) / name)
+            super().__init__(*args, http_server_root=Path(folder), **options)
+
+    try:
+        infra.WebsockServer = Named
+        yield
+    finally:
+        infra.WebsockServer = usual
 
 
 def _free_port(host: str) -> int:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from fusecap.live.devices.sensor_feed import SensorFeed
 from fusecap.live.devices.source import Deliver, SessionClock, SourceCounts, SourceLost
 from fusecap.sources.live_sensor import MAX_DATAGRAM_BYTES, Packet
-from fusecap.streams.target import is_loopback
+from fusecap.streams.door import is_loopback
 
 LISTEN_S = 0.2
 """How long one look at the socket takes, and so how soon the source stops."""

@@ -27,6 +27,7 @@ from scipy.spatial.transform import Rotation
 
 from fusecap.body.shape import BodyShape
 from fusecap.geometry.quaternions import to_wxyz
+from fusecap.streams.door import Door
 from fusecap.streams.person_pose import StreamFrame
 from fusecap.streams.stream import Cast, StreamProtocol
 from fusecap.streams.target import Target
@@ -114,7 +115,9 @@ class WebSocketStream:
     def __init__(self, target: Target, cast: Cast, rate_hz: float) -> None:
         self.target = target
         self.counts = Counts()
-        self._server = WebSocketServer(target.host, target.port, self.counts)
+        self._server = WebSocketServer(
+            target.host, target.port, self.counts, Door(token=target.token)
+        )
         self._rate_hz = rate_hz
         self.set_cast(cast)
 
@@ -132,13 +135,13 @@ class WebSocketStream:
 
     def remark(self) -> str:
         if not self._server.clients_ever:
-            return f"no client has connected; open {self.target} or {self.target}/binary"
+            return f"no client has connected; open {self.target.address}, or /binary there"
         if self.counts.dropped:
             return "a client is too slow and misses frames"
         return ""
 
     def where(self) -> dict[str, str]:
-        return {}
+        return {"everyone": self.target.address}
 
     def close(self) -> None:
         self._server.close()
