@@ -26,9 +26,9 @@ _UNSHOWN = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud
 
 
 def shown(text: str) -> str:
-    """The text with `\\x1b` and the like in place of what a terminal would obey or choke on."""
+    """The text, with the numbers of characters that a terminal would obey or choke on."""
     return _UNSHOWN.sub(lambda found: found[0].encode("unicode_escape").decode("ascii"), text)
-    """The text with the numbers of characters that a terminal would obey or choke on."""
+
 
 class _TextConsole(Console):
     def render_str(self, text: str, **options: Any) -> Text:
