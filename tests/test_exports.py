@@ -184,6 +184,7 @@ def test_trc_says_its_unit_and_leaves_gaps_empty(tmp_path, unit, unit_m):
         assert len(names) == int(head["NumMarkers"]) and "left_knee" in names
         cells = [line.split("\t") for line in lines[6:-1]]
         assert [c[0] for c in cells] == [str(n) for n in range(1, 7)]
+        assert {len(c) for c in cells} == {2 + 3 * len(names)}
         empty = [not any(c[2:]) for c in cells]
         assert empty == [row == 0 and frame == 2 for frame in range(6)]
         values = unit_m * np.array([c[2:] for c in cells if c[2]], dtype=float)

@@ -29,7 +29,8 @@ from fusecap.inputs import TAKE, read_npz
 from fusecap.types import Estimate, Status, quality_of
 
 FORMAT_VERSION = 2
-_FORMAT = f"fusecap take {FORMAT_VERSION}"
+_FORMAT_NAME = "fusecap take "
+_FORMAT = f"{_FORMAT_NAME}{FORMAT_VERSION}"
 _ENTRIES = (
     *("format", "timestamps_ns", "rate_hz", "subject_names", "skeleton", "bone_names", "parents"),
     *("heights_m", "offsets_m", "theta", "bone_position_in_world_m"),
@@ -386,12 +387,24 @@ def save_take(take: Take, path: Path | str) -> None:
         np.savez(file, **arrays)
 
 
+def is_take(path: Path | str) -> bool:
+    """Whether a take of any version stands there."""
+    try:
+        return _stated_format(read_npz(path, TAKE, ("format",))).startswith(_FORMAT_NAME)
+    except TakeError:
+        return False
+
+
+def _stated_format(arrays: Mapping[str, np.ndarray]) -> str:
+    return str(arrays.get("format", ""))
+
+
 def load_take(path: Path | str) -> Take:
     """Read a take; raises `TakeError` for a file that is missing, damaged or something else."""
     path = Path(path)
     arrays = read_npz(path, TAKE, _ENTRIES)
-    found = str(arrays.get("format", ""))
-    if not found.startswith("fusecap take "):
+    found = _stated_format(arrays)
+    if not found.startswith(_FORMAT_NAME):
         raise TakeError(f"{path} is not a take: it has no 'format' entry of fusecap")
     if found != _FORMAT:
         raise TakeError(

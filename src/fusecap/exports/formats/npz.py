@@ -9,7 +9,6 @@ A root's values are in the world: right-handed, y up. Frames without a person ho
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -19,15 +18,13 @@ from fusecap.errors import TakeError
 from fusecap.exports.rig_motion import rig_motions
 from fusecap.exports.take_format import ExportOptions, TakeFormat
 from fusecap.files import written_whole
-from fusecap.take import Take
+from fusecap.take import Take, is_take
 
 
 def write_npz(take: Take, path: Path, options: ExportOptions) -> None:
     """Writes everybody who is tracked, whole or not at all; never over a take."""
-    if path.exists() and zipfile.is_zipfile(path):
-        with np.load(path, allow_pickle=False) as found:
-            if "theta" in found.files:
-                raise TakeError(f"{path} is a take: export to another name")
+    if is_take(path):
+        raise TakeError(f"{path} is a take: export to another name")
     motions = rig_motions(take, options.rig)
     rest = [motion.rest for motion in motions]
     rows = [take.subject(motion.name) for motion in motions]

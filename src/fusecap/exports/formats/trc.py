@@ -34,7 +34,7 @@ def write_trc(take: Take, path: Path, options: ExportOptions) -> None:
         "",
     ]
     row = f"\t%.{_DECIMALS[options.unit]}f" * values.shape[1] + "\n"
-    missing = "\t" * (values.shape[1] + 1) + "\n"
+    missing = "\t" * values.shape[1] + "\n"
     with written_whole(path) as file:
         file.write(("\n".join(head) + "\n").encode())
         for frame, time_s in enumerate(take.time_s.tolist()):
