@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from fusecap.edits.edit import EditOptions as EditOptions
     from fusecap.edits.edit import edit_take as edit_take
     from fusecap.errors import FusecapError as FusecapError
+    from fusecap.exports.characters.retarget import retarget as retarget
     from fusecap.exports.take_files import export as export
     from fusecap.geometry.camera import Camera as Camera
     from fusecap.geometry.camera import Rig as Rig

@@ -33,6 +33,7 @@ from fusecap.cli import (
     export,
     init,
     live,
+    retarget,
     simulate,
     solve,
     stream,
@@ -79,6 +80,7 @@ app.command(epilog=detect.EXAMPLE)(detect.detect)
 app.command(epilog=solve.EXAMPLE)(solve.solve)
 app.command(epilog=edit.EXAMPLE)(edit.edit)
 app.command(epilog=export.EXAMPLE)(export.export)
+app.command(epilog=retarget.EXAMPLE)(retarget.retarget)
 app.command(epilog=doctor.EXAMPLE)(doctor.doctor)
 app.command(epilog=init.EXAMPLE)(init.init)
 app.command(epilog=live.EXAMPLE)(live.live)

@@ -9,16 +9,14 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from fusecap.body.pose import theta_from_rotations
 from fusecap.edits.butterworth import runs
 from fusecap.feet import standing
+from fusecap.geometry.two_bone import two_bone_turns
 from fusecap.take import Take
 
 _EASE_S = 0.1
-_STRETCHED = 0.9995
-"""A leg reaches no further than this share of its length."""
 
 
 def lock_feet(take: Take, strength: float) -> tuple[Take, int]:
@@ -69,38 +67,8 @@ def _reach(
     if not moves.any():
         return
     hip, knee, ankle, target = hip[moves], knee[moves], ankle[moves], target[moves]
-    upper, lower = np.linalg.norm(take.offsets_m[row, [shank, foot]], axis=1)
-    reach = np.linalg.norm(target - hip, axis=1)
-    reach = np.clip(reach, abs(upper - lower) * 1.001, (upper + lower) * _STRETCHED)
-    along = _unit(target - hip)
-    beside = (knee - hip) - along * _dot(knee - hip, along)
-    forward = rotation[moves][:, thigh, :, 2]
-    forward = forward - along * _dot(forward, along)
-    straight = np.linalg.norm(beside, axis=1) < 1e-4
-    bend = _unit(np.where(straight[:, None], forward, beside))
-    cosine = np.clip((upper**2 + reach**2 - lower**2) / (2 * upper * reach), -1.0, 1.0)
-    sine = np.sqrt(1 - cosine**2)
-    new_knee = hip + upper * (cosine[:, None] * along + sine[:, None] * bend)
-    new_ankle = hip + reach[:, None] * along
-    rotation[moves, thigh] = _least_turn(knee - hip, new_knee - hip) @ rotation[moves, thigh]
-    turn = _least_turn(ankle - knee, new_ankle - new_knee)
-    rotation[moves, shank] = turn @ rotation[moves, shank]
-
-
-def _least_turn(
-    one: Float[np.ndarray, "n 3"], other: Float[np.ndarray, "n 3"]
-) -> Float[np.ndarray, "n 3 3"]:
-    """The shortest rotation that takes one direction to the other."""
-    axis = np.cross(one, other)
-    sine = np.linalg.norm(axis, axis=1)
-    angle = np.arctan2(sine, np.einsum("ni,ni->n", one, other))
-    vector = axis * (angle / np.maximum(sine, 1e-15))[:, None]
-    return Rotation.from_rotvec(vector).as_matrix()
-
-
-def _unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
-
-
-def _dot(one: Float[np.ndarray, "n 3"], other: Float[np.ndarray, "n 3"]) -> np.ndarray:
-    return np.einsum("ni,ni->n", one, other)[:, None]
+    turn_thigh, turn_shank = two_bone_turns(
+        hip, knee, ankle, target, forward=rotation[moves][:, thigh, :, 2]
+    )
+    rotation[moves, thigh] = turn_thigh @ rotation[moves, thigh]
+    rotation[moves, shank] = turn_shank @ rotation[moves, shank]

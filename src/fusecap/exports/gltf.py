@@ -17,16 +17,18 @@ _VERTICES, _INDICES = 34962, 34963
 
 
 class Gltf:
-    """A document in the making."""
+    """A document in the making: a new one, or one that is added to."""
 
-    def __init__(self, generator: str) -> None:
-        self.tree: dict[str, Any] = {
-            "asset": {"version": "2.0", "generator": generator},
-            "scene": 0,
-            "scenes": [{"nodes": []}],
-        }
-        self._chunks: list[bytes] = []
-        self._length = 0
+    def __init__(self, tree: dict[str, Any], binary: bytes = b"") -> None:
+        self.tree = tree
+        self._chunks = [binary + b"\0" * (-len(binary) % 4)]
+        self._length = len(self._chunks[0])
+
+    @classmethod
+    def new(cls, generator: str) -> Gltf:
+        """One scene with nothing in it."""
+        asset = {"version": "2.0", "generator": generator}
+        return cls({"asset": asset, "scene": 0, "scenes": [{"nodes": []}]})
 
     def add(self, kind: str, item: dict[str, Any]) -> int:
         """Appends to a list of the tree, such as "nodes"; returns its index."""
@@ -68,7 +70,8 @@ class Gltf:
     def write(self, path: Path) -> None:
         """Whole or not at all."""
         if self._length:
-            self.tree["buffers"] = [{"byteLength": self._length}]
+            buffers = self.tree.setdefault("buffers", [{}])
+            buffers[0] = {**buffers[0], "byteLength": self._length}
         text = json.dumps(self.tree, separators=(",", ":"), ensure_ascii=False).encode()
         text += b" " * (-len(text) % 4)
         total = 12 + 8 + len(text) + (8 + self._length if self._length else 0)

@@ -40,6 +40,20 @@ class RigMotion:
         reach = np.abs(self.position_m - self.rest.position_in_parent_m).max(axis=(0, 2))
         return tuple(np.flatnonzero(reach > _MOVES_M).tolist())
 
+    def in_world(self) -> tuple[list[Float[np.ndarray, "t 3"]], list[Rotation]]:
+        """Places [m] and turns of the joints in the world."""
+        places: list[np.ndarray] = []
+        turns: list[Rotation] = []
+        for joint, parent in enumerate(self.rest.parents):
+            place = self.position_m[:, joint]
+            turn = Rotation.from_quat(self.rotation_xyzw[:, joint])
+            if parent >= 0:
+                place = places[parent] + turns[parent].apply(place)
+                turn = turns[parent] * turn
+            places.append(place)
+            turns.append(turn)
+        return places, turns
+
     def rotation_from_rest(self) -> Float[np.ndarray, "t j 3 3"]:
         """Relative to the parent, between frames that are parallel to the world at rest."""
         rest = Rotation.from_matrix(self.rest.rotation)
@@ -123,7 +137,7 @@ def _on_joints(
             up = world[parent].inv()
             position_m[:, index] = up.apply(place_m[:, index] - place_m[:, parent])
             local = up * local
-        xyzw[:, index] = _short_way(local.as_quat())
+        xyzw[:, index] = short_way(local.as_quat())
     return RigMotion(
         rest=rest,
         name=take.subject_names[subject],
@@ -134,7 +148,7 @@ def _on_joints(
     )
 
 
-def _short_way(quaternion: Float[np.ndarray, "t 4"]) -> Float[np.ndarray, "t 4"]:
+def short_way(quaternion: Float[np.ndarray, "t 4"]) -> Float[np.ndarray, "t 4"]:
     """The same rotations with signs such that neighbours are near."""
     flips = np.einsum("ti,ti->t", quaternion[1:], quaternion[:-1]) < 0
     signs = np.where(np.logical_xor.accumulate(np.concatenate([[False], flips])), -1.0, 1.0)

@@ -16,7 +16,7 @@ from fusecap.take import Take, made_by
 
 def write_glb(take: Take, path: Path, options: ExportOptions) -> None:
     """Writes everybody who is tracked, whole or not at all."""
-    gltf = Gltf(made_by())
+    gltf = Gltf.new(made_by())
     people = []
     for row, motion in enumerate(rig_motions(take, options.rig)):
         nodes = add_joints(gltf, motion)

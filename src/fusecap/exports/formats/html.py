@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from fusecap.body.shape import REFERENCE_HEIGHT_M
 from fusecap.exports.gltf_people import COLOURS
@@ -79,16 +78,7 @@ def write_html(take: Take, path: Path, _: ExportOptions) -> None:
 def _points_m(motion: RigMotion) -> np.ndarray:
     """Joints, tips of leaves, the head's middle, the nose: (T, P, 3) in the world."""
     rest = motion.rest
-    places: list[np.ndarray] = []
-    turns: list[Rotation] = []
-    for joint, parent in enumerate(rest.parents):
-        turn = Rotation.from_quat(motion.rotation_xyzw[:, joint])
-        place = motion.position_m[:, joint]
-        if parent >= 0:
-            place = places[parent] + turns[parent].apply(place)
-            turn = turns[parent] * turn
-        places.append(place)
-        turns.append(turn)
+    places, turns = motion.in_world()
     tips = [
         places[leaf] + turns[leaf].apply(rest.tip_m[leaf] - rest.position_m[leaf])
         for leaf in rest.leaves

@@ -14,7 +14,7 @@ from fusecap.exports.take_format import UNITS_PER_M, ExportOptions, TakeFormat
 from fusecap.files import written_whole
 from fusecap.take import Take
 
-_DECIMALS = {"mm": 1, "m": 4}
+_DECIMALS = {"mm": 2, "m": 5}
 
 
 def write_trc(take: Take, path: Path, options: ExportOptions) -> None:

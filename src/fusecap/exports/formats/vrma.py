@@ -19,7 +19,7 @@ _EXTENSION = "VRMC_vrm_animation"
 
 def write_vrma(take: Take, path: Path, _: ExportOptions) -> None:
     """Writes the one subject of `take`, whole or not at all."""
-    gltf = Gltf(made_by())
+    gltf = Gltf.new(made_by())
     (motion,) = rig_motions(take, "vrm")
     nodes = add_joints(gltf, motion)
     add_animation(gltf, [(motion, nodes)], "take", only_root_moves=True)

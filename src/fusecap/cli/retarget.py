@@ -1,0 +1,61 @@
+"""`fusecap retarget`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fusecap.cli.common import Json, named, print_json
+from fusecap.cli.terminal import console, table_of, wrote
+from fusecap.files import safe_name
+
+EXAMPLE = "Example: fusecap retarget duo/duo.npz avatar.vrm --subject anna --out anna.glb"
+
+
+def retarget(
+    take: Annotated[
+        Path, typer.Argument(help="A solved take (.npz), or the recording (.mcap) of a live run.")
+    ],
+    character: Annotated[
+        Path, typer.Argument(help="A rigged character: .glb, .vrm, or .fbx (needs Blender).")
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(help="The file to write, .glb, .vrm or .fbx; default beside the take."),
+    ] = None,
+    subject: Annotated[
+        str | None, typer.Option(help="Whose motion; needed where the take has several people.")
+    ] = None,
+    map: Annotated[
+        list[str] | None,
+        typer.Option(help="BONE=NAME: the character's name of one of our bones, if not guessed."),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Put a person's motion onto a character of your own: its proportions, feet that stand.
+
+    Bones are matched by VRM's map or by their names, and shown.
+    """
+    from fusecap.batch.replay import open_take
+    from fusecap.exports.characters.retarget import retarget as onto
+
+    stem = f"{take.stem}_{safe_name(character.stem)}"
+    ending = ".fbx" if character.suffix.lower() == ".fbx" else ".glb"
+    done = onto(
+        open_take(take),
+        character,
+        out or take.with_name(stem + ending),
+        subject=subject,
+        bones=dict(named("--map", text, "BONE=NAME") for text in map or ()),
+    )
+    if as_json:
+        print_json({"files": [str(done.path)], "bones": done.bones, "scale": done.scale})
+        return
+    table = table_of("ours", "the character's")
+    for bone, name in done.bones.items():
+        table.add_row(bone, name)
+    console.print(table)
+    console.print(f"  ways through the room are scaled by {done.scale:.3f}, as legs are")
+    wrote(done.path)

@@ -1,0 +1,1 @@
+"""Motion onto somebody else's rigged character."""
