@@ -348,7 +348,7 @@ def test_people_far_beside_a_camera_do_not_overflow_the_drawing():
     rig = ring(1)
     pictures = Pictures(rig, BODY25)
     people = np.full((1, 25, 3), 1e12)
-    pictures.draw(0, None, people, {"anna": pose_in(standing(place_m=(1e6, 4.0)))}, {"anna": BLUE})
+    pictures.draw(0, None, people, {"anna": pose_in(standing(place_m=(9e3, 4.0)))}, {"anna": BLUE})
     assert pictures.drawn[0].shape == (180, WIDTH_PX, 3)
 
 

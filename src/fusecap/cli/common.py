@@ -19,6 +19,7 @@ from fusecap.files import plain
 if TYPE_CHECKING:
     from fusecap.batch.solve import Solved
     from fusecap.exports.take_format import ExportOptions
+    from fusecap.take import Take
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object for machines.")]
 Unit = Annotated[
@@ -78,16 +79,17 @@ class Exports:
     options: ExportOptions | None = None
 
 
-def write_take(solved: Solved, path: Path, exports: Exports, *, picture: bool) -> list[Path]:
+def write_take(
+    take: Take, path: Path, exports: Exports, *, picture: bool, interrupted: bool = False
+) -> list[Path]:
     """The take, its exports and its picture; exports of a take that stood there are set aside.
 
-    What an interrupted solve has goes beside `path`, by names of its own: a whole take stays.
+    What an `interrupted` solve has goes beside `path`, by names of its own: a whole take stays.
     """
     from fusecap.exports.take_files import export_all, set_aside
     from fusecap.take import load_take, save_take
 
-    take = solved.take
-    if solved.report.interrupted:
+    if interrupted:
         path = path.with_name(f"{path.stem}-interrupted{path.suffix}")
     try:
         earlier = load_take(path).subject_names

@@ -65,7 +65,13 @@ def demo(
     with progress(quiet=as_json) as show:
         solved = solve_simulation(simulation, associate=associate, progress=show)
         live = live_takes(simulation, associate=associate, lag_s=LAG_S, progress=show)
-    files = write_take(solved, out / "demo.npz", Exports(formats=["bvh"]), picture=True)
+    files = write_take(
+        solved.take,
+        out / "demo.npz",
+        Exports(formats=["bvh"]),
+        picture=True,
+        interrupted=solved.report.interrupted,
+    )
     score = score_take(solved.take, simulation.truth)
     newest, settled = (score_take(take, simulation.truth) for take in live)
     result = {

@@ -97,7 +97,13 @@ def solve(
     if not solved.take.tracked.any():
         _stop_without_poses(solved, _nobody(solved.report))
     seen = ExportOptions(cameras=data.rig, landmarks=data.landmarks)
-    files = write_take(solved, target, replace(exports, options=seen), picture=picture)
+    files = write_take(
+        solved.take,
+        target,
+        replace(exports, options=seen),
+        picture=picture,
+        interrupted=solved.report.interrupted,
+    )
     detection = {} if detected is None else {"detection": detected.as_json()}
     _print_solved(solved, files, detection, as_json)
 
@@ -131,7 +137,9 @@ def _solve_recording(
             f"nobody could be followed in {solved.report.instants} instants of {path}; nothing "
             f"was written. What is in it: fusecap doctor {path}",
         )
-    files = write_take(solved, target, exports, picture=picture)
+    files = write_take(
+        solved.take, target, exports, picture=picture, interrupted=solved.report.interrupted
+    )
     _print_solved(solved, files, replay, quiet)
 
 
