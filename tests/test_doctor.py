@@ -84,7 +84,7 @@ def test_wrong_up_axis_is_found_by_the_people(tmp_path):
 def test_calibration_of_another_scale_is_found_by_the_people(tmp_path):
     path = write_session(tmp_path)
     (tmp_path / "calibration.toml").write_text(calibration_toml(ring(), unit_per_metre=3))
-    assert any("from ankle to head" in text for text in said(path, "warning"))
+    assert any("as their limbs measure" in text for text in said(path, "warning"))
 
 
 def test_camera_without_people_is_found(tmp_path):

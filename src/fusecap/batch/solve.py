@@ -20,6 +20,8 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from fusecap.body.shape import BodyShape
+from fusecap.checks import check_measurements
+from fusecap.errors import SessionError
 from fusecap.files import plain
 from fusecap.pipeline import Pipeline, make_estimator, observation_of
 from fusecap.progress import Progress
@@ -112,14 +114,25 @@ class Solved:
     report: SolveReport
 
 
-def solve_session(data: SessionData, *, progress: Progress | None = None) -> Solved:
-    """Solve an opened session; raises `SessionError` where nothing can be solved."""
+def solve_session(
+    data: SessionData, *, progress: Progress | None = None, anyway: bool = False
+) -> Solved:
+    """Solve an opened session; what is odd about it is in the report's notes.
+
+    Raises `SessionError` for what is an error to doctor, unless `anyway`.
+    """
+    found = check_measurements(data.session, data.rig, data.keypoints, data.samples, data.times_s)
+    errors = [finding for finding in found if finding.severity == "error"]
+    if errors and not anyway:
+        listed = "\n".join(f"{data.session.path}: {finding}" for finding in errors)
+        raise SessionError(f"{listed}\nto solve it all the same: fusecap solve --anyway")
+    odd = [finding for finding in found.sorted() if finding.severity != "info"]
     return solve_instants(
         setup_of(data.session, data.rig, data.landmarks),
         SessionInstants(data),
         progress=progress,
         session_sha256=data.content_hash,
-        notes=tuple(str(finding) for finding in data.findings),
+        notes=tuple(str(finding) for finding in (*data.findings, *odd)),
     )
 
 

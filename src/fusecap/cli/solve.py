@@ -61,6 +61,10 @@ def solve(
             help="Of a recording: the poses of the run again, instead of a better second solve.",
         ),
     ] = False,
+    anyway: Annotated[
+        bool,
+        typer.Option("--anyway", help="Also a session that doctor finds errors in."),
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Solve a recorded session, or the recording of a live run, to each person's motion.
@@ -93,7 +97,7 @@ def solve(
         raise KeyboardInterrupt
     with progress(quiet=as_json) as show:
         data = open_session(loaded, show)
-        solved = solve_session(data, progress=show)
+        solved = solve_session(data, progress=show, anyway=anyway)
     if not solved.take.tracked.any():
         _stop_without_poses(solved, _nobody(solved.report))
     seen = ExportOptions(cameras=data.rig, landmarks=data.landmarks)

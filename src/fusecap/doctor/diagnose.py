@@ -4,17 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
+from fusecap.checks import check_measurements
 from fusecap.doctor.detection import check_detection
 from fusecap.doctor.folder import PRINT_A_BOARD, check_folder
-from fusecap.doctor.imus import check_imus
-from fusecap.doctor.keypoints import check_keypoints
-from fusecap.doctor.views import check_views
 from fusecap.errors import FusecapError
 from fusecap.findings import Finding, Findings
 from fusecap.progress import Progress
-from fusecap.sources.keypoint_files import KeypointTrack
 from fusecap.sources.session import FILE_NAME, Session
 from fusecap.sources.session_cameras import with_detections
 from fusecap.sources.session_data import open_inputs
@@ -23,9 +18,6 @@ from fusecap.sources.session_file import (
     parse_session,
     with_imu_calibration,
 )
-
-SHORT_S = 0.5
-"""A person is followed for about as long before becoming a subject."""
 
 
 def diagnose(path: Path | str, progress: Progress | None = None) -> list[Finding]:
@@ -58,13 +50,13 @@ def diagnose(path: Path | str, progress: Progress | None = None) -> list[Finding
     inputs = open_inputs(session, failed, progress)
     findings += inputs.findings
     check_detection(session, findings)
-    tracks = {track.name: track for track in inputs.keypoints if track is not None}
-    check_keypoints(tracks, inputs.rig, findings)
-    check_imus(session, inputs.imus, findings)
-    _check_amount(session, tracks, findings)
-    if inputs.times_s is not None:
-        _check_length(inputs.times_s, findings)
-    check_views(session, inputs.rig, tracks, findings)
+    findings += check_measurements(
+        inputs.session,
+        inputs.rig,
+        [track for track in inputs.keypoints if track is not None],
+        inputs.imus,
+        inputs.times_s,
+    )
     return findings.sorted()
 
 
@@ -104,41 +96,3 @@ def _calibrated(session: Session, findings: Findings) -> Session:
 def _split(line: str) -> tuple[str, str]:
     where, _, found = line.partition(": ")
     return (where, found) if found else ("session", line)
-
-
-def _check_length(times_s: np.ndarray, findings: Findings) -> None:
-    length_s = float(times_s[-1] - times_s[0])
-    if length_s < SHORT_S:
-        findings.add(
-            "warning",
-            "session",
-            f"lasts {length_s:.2f} s in all",
-            f"people are found once they are followed for {SHORT_S:g} s: record longer, and see "
-            "whether files are whole",
-        )
-
-
-def _check_amount(session: Session, tracks: dict[str, KeypointTrack], findings: Findings) -> None:
-    with_imus = any(subject.imus for subject in session.subjects)
-    seen = sum(len(people) for track in tracks.values() for people in track.people)
-    if tracks and seen == 0:
-        findings.add(
-            "warning" if with_imus else "error",
-            "cameras",
-            "no camera sees anyone",
-            "check the detector's output",
-        )
-    if len(session.cameras) == 0:
-        findings.add(
-            "info",
-            "session",
-            "no camera: where the subjects stand is not observed, only their posture",
-            "add cameras for positions",
-        )
-    if len(session.cameras) == 1:
-        findings.add(
-            "warning",
-            f"camera '{session.cameras[0].name}'",
-            "is the only one: depth is not observed",
-            "add a second camera",
-        )

@@ -28,6 +28,10 @@ from fusecap.sources.detection_files import read_record
 MAX_FRAME = 10**9
 """Longer numbers are dates or serials."""
 
+LEAST_STEPPED = 10
+"""Fewer frames say nothing about how a detector counts."""
+REGULAR_SHARE = 0.5
+"""Of the steps between frames, for those that skip more to be frames without people."""
 _OLD_KEY = "pose_keypoints"
 _KNOWN_SETS = "known are " + ", ".join(
     f"{landmarks.keypoint_count} (openpose-{landmarks.name})"
@@ -45,6 +49,8 @@ class KeypointTrack:
     rate_hz: float
     frames: np.ndarray
     """(F,) frame numbers, ascending; a missing number is a frame without people."""
+    step: int = 1
+    """Of its video's frames every so many were looked at, and numbered; `frames` counts these."""
     times_s: np.ndarray
     """(F,) on the session's clock: frame / rate, or the video's own time, + offset."""
     people: tuple[np.ndarray, ...]
@@ -99,15 +105,26 @@ def read_keypoints(
                 f"{len(record.times_ns)}; delete the folder and detect again"
             )
         times_s, rate_hz = record.frame_times_s(frames), record.video.rate_hz
+    step = frame_step(frames)
     return KeypointTrack(
         name=name,
         landmarks=landmarks,
-        rate_hz=rate_hz,
-        frames=frames,
+        rate_hz=rate_hz / step,
+        frames=frames // step,
+        step=step,
         times_s=times_s + offset_s,
         people=tuple(people),
         broken=tuple(broken),
     )
+
+
+def frame_step(frames: np.ndarray) -> int:
+    """How far apart frame numbers regularly are: 1, or what all of many are multiples of."""
+    if len(frames) < LEAST_STEPPED:
+        return 1
+    steps = np.diff(frames)
+    step = int(np.gcd.reduce(steps))
+    return step if step > 1 and np.mean(steps == step) > REGULAR_SHARE else 1
 
 
 def frame_number(name: str) -> int | None:

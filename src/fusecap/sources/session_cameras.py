@@ -80,11 +80,13 @@ def open_rig(session: Session) -> tuple[Rig, list[Finding]]:
             f"{session.path}: [session] calibration is missing; cameras need a calibration file, "
             "as fusecap calibrate extrinsics writes it"
         )
+    names = [camera.name for camera in session.cameras]
     rig = load_rig(
         session.settings.calibration,
         up=session.settings.up,
         unit=session.settings.calibration_unit,
-    ).subset([camera.name for camera in session.cameras])
+        names=names,
+    ).subset(names)
     return rig, check_rig(rig, floor=session.settings.floor)
 
 
@@ -164,4 +166,15 @@ def broken_files(track: KeypointTrack) -> Finding:
         found=f"{len(track.broken)} of {len(track.frames)} keypoint files ({share:.1%}) are "
         f"truncated or garbled (first: {track.broken[0]})",
         remedy="they count as frames without people; run the detector again on these frames",
+    )
+
+
+def stepped_frames(track: KeypointTrack) -> Finding:
+    """The finding for a detector that looked at every so many frames only."""
+    return Finding(
+        severity="warning",
+        where=f"camera '{track.name}'",
+        found=f"only every {track.step}. frame has keypoints: taken as {track.rate_hz:g} Hz",
+        remedy="detect every frame for fast motion; where the camera recorded at this rate, number "
+        "its frames 0, 1, 2 and state rate_hz",
     )

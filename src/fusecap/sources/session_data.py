@@ -31,9 +31,15 @@ from fusecap.sources.session_cameras import (
     camera_track,
     common_landmarks,
     open_rig,
+    stepped_frames,
     with_detections,
 )
-from fusecap.sources.session_sensors import mount, open_some_imus, sensor_notes
+from fusecap.sources.session_sensors import (
+    mount,
+    open_some_imus,
+    sensor_notes,
+    without_unplaced_sensors,
+)
 from fusecap.sources.sync_files import Clock, Clocks, read_sync
 from fusecap.sources.synchronizer import (
     MAX_GAP_S,
@@ -85,6 +91,8 @@ class SessionData:
     keypoints: tuple[KeypointTrack, ...]
     imus: tuple[SubjectImus, ...]
     """Subjects that carry sensors, in the order of the [[subject]] tables."""
+    samples: dict[str, list[ImuTrack | None]]
+    """Per subject what its sensors measured, on the session's clock."""
     times_s: np.ndarray
     """(T,) instants of the solve on the session's clock."""
     findings: tuple[Finding, ...]
@@ -153,6 +161,8 @@ def open_inputs(
         return replace(track, times_s=clock.session_s(track.times_s))
 
     rig, findings = attempt("calibration", lambda: open_rig(session)) or (None, [])
+    session, unplaced = without_unplaced_sensors(session)
+    findings += unplaced
     landmarks = attempt("cameras", lambda: common_landmarks(session))
     clocks = attempt("clocks", lambda: session_clocks(session)) or Clocks()
     keypoints: list[KeypointTrack | None] = []
@@ -164,6 +174,8 @@ def open_inputs(
         if track is not None:
             if track.broken:
                 findings.append(broken_files(track))
+            if track.step > 1:
+                findings.append(stepped_frames(track))
             track = on_clock(track, clocks.camera(track.name))
         keypoints.append(track)
     findings += unplaced_wearers(session)
@@ -204,7 +216,7 @@ def open_session(session: Session, progress: Progress | None = None) -> SessionD
     if inputs.rig is None or inputs.times_s is None:
         raise SessionError(f"{session.path}: neither a camera nor a sensor: nothing to solve")
     imus = []
-    for subject in session.subjects:
+    for subject in inputs.session.subjects:
         if subject.imus:
             tracks = [track for track in inputs.imus[subject.name] if track is not None]
             mounted = mount(subject, tracks)
@@ -224,6 +236,7 @@ def open_session(session: Session, progress: Progress | None = None) -> SessionD
         landmarks=inputs.landmarks,
         keypoints=tuple(track for track in inputs.keypoints if track is not None),
         imus=tuple(imus),
+        samples=inputs.imus,
         times_s=inputs.times_s,
         findings=tuple(inputs.findings),
         content_hash=content_hash(session),

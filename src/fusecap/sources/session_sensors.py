@@ -12,11 +12,13 @@ from fusecap.errors import SessionError
 from fusecap.findings import Finding
 from fusecap.geometry.quaternions import from_wxyz
 from fusecap.sources.imu_files import ImuTrack, read_imu
-from fusecap.sources.session import ImuSettings, SubjectSettings
+from fusecap.sources.session import ImuSettings, Session, SubjectSettings
 from fusecap.sources.synchronizer import MountedImu, world_from_imu_world
 
 LEAST_COMMON = 0.5
 """Of the shortest recording: of sensors that share less of it by their clock, it is not one."""
+TPOSE_MOVED_DEG = 15.0
+"""95th percentile from a sensor's mean orientation: twice what people's T-poses are off anyway."""
 _NOT_SYNCHRONISED = "its counter is not on the other sensors' clock"
 
 
@@ -123,6 +125,32 @@ def sensor_notes(subject: SubjectSettings, tracks: Sequence[ImuTrack | None]) ->
     return findings
 
 
+def without_unplaced_sensors(session: Session) -> tuple[Session, list[Finding]]:
+    """Of a calibrated session, without the sensors that calibration could not place."""
+    if session.settings.imu_calibration is None:
+        return session, []
+    subjects, findings = [], []
+    for subject in session.subjects:
+        placed = tuple(
+            imu
+            for imu in subject.imus
+            if imu.bone_from_imu_wxyz is not None or subject.tpose_s is not None
+        )
+        left_out = [imu.bone for imu in subject.imus if imu not in placed]
+        subjects.append(subject.model_copy(update={"imus": placed}))
+        if left_out:
+            findings.append(
+                Finding(
+                    severity="warning",
+                    where=f"sensors of '{subject.name}'",
+                    found=f"left out: {', '.join(left_out)}, which "
+                    f"{session.settings.imu_calibration.name} does not hold",
+                    remedy="fusecap calibrate imu says why it could not place them",
+                )
+            )
+    return session.model_copy(update={"subjects": tuple(subjects)}), findings
+
+
 def mount(subject: SubjectSettings, tracks: list[ImuTrack]) -> list[MountedImu]:
     """Sensors with their offsets; `bone_from_imu` from the T-pose where it is not given."""
     return [
@@ -154,7 +182,14 @@ def _bone_from_imu(subject: SubjectSettings, imu: ImuSettings, track: ImuTrack) 
             f"{where}: no sample in tpose_s = [{start_s:g}, {end_s:g}]; its samples run from "
             f"{track.times_s[0]:g} to {track.times_s[-1]:g} s"
         )
-    mean = from_wxyz(track.orientation_wxyz[inside]).mean().as_matrix()
-    world_from_imu = world_from_imu_world(imu.imu_up, imu.heading_deg) @ mean
+    turned = from_wxyz(track.orientation_wxyz[inside])
+    mean = turned.mean()
+    moved_deg = float(np.degrees(np.percentile((mean.inv() * turned).magnitude(), 95)))
+    if moved_deg > TPOSE_MOVED_DEG:
+        raise SessionError(
+            f"{where}: turns by {moved_deg:.0f} deg within tpose_s = [{start_s:g}, {end_s:g}]; "
+            "choose a stretch in which the subject stands still in the T-pose"
+        )
+    world_from_imu = world_from_imu_world(imu.imu_up, imu.heading_deg) @ mean.as_matrix()
     world_from_bone = Rotation.from_euler("y", subject.tpose_facing_deg, degrees=True).as_matrix()
     return world_from_bone.T @ world_from_imu

@@ -14,7 +14,6 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from fusecap.body.landmarks import LandmarkSet
 from fusecap.geometry.camera import Camera, Rig
 from fusecap.geometry.epipolar import essential_matrix
 from fusecap.sources.keypoint_files import KeypointTrack
@@ -133,33 +132,34 @@ def best_shift_s(
     return float(shifts_s[best]), float(left[best])
 
 
-def standing_people(
-    rig: Rig, tracks: Sequence[KeypointTrack], landmarks: LandmarkSet, times_s: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Heads and ankle centres (n, 3) in the world [m], triangulated from pairs of views."""
-    top = next(
-        (i for name in ("nose", "head_top", "neck") if (i := landmarks.index(name)) is not None),
-        None,
+def camera_disagreement_px(
+    rig: Rig, tracks: Sequence[KeypointTrack], camera: int, times_s: np.ndarray
+) -> float:
+    """What one camera disagrees by with the typical other one, as `per_camera_px` of all."""
+    views = [[people_at(track, t) for t in times_s] for track in tracks]
+    known = np.sort(
+        [
+            _median_px(rig.cameras[camera], rig.cameras[other], views[camera], views[other])
+            for other in range(len(tracks))
+            if other != camera
+        ]
     )
-    ankles = [landmarks.index(f"{side}_ankle") for side in ("left", "right")]
-    heads, feet = [np.empty((0, 3))], [np.empty((0, 3))]
-    if top is None or None in ankles:
-        return heads[0], feet[0]
-    wanted = [top, *(ankle for ankle in ankles if ankle is not None)]
+    known = known[np.isfinite(known)]
+    return float(known[(len(known) - 1) // 2]) if len(known) else float("inf")
+
+
+def people_in_world(rig: Rig, tracks: Sequence[KeypointTrack], times_s: np.ndarray) -> np.ndarray:
+    """(n, K, 3) landmarks [m] of people whom pairs of views agree about; NaN where not seen."""
+    found = [np.empty((0, len(tracks[0].landmarks.landmark_names), 3))]
+    views = [[people_at(track, t) for t in times_s] for track in tracks]
     for i, first in enumerate(rig.cameras):
         for j, second in enumerate(rig.cameras[i + 1 :], start=i + 1):
-            for t_s in times_s:
-                a, b = people_at(tracks[i], t_s), people_at(tracks[j], t_s)
+            for a, b in zip(views[i], views[j], strict=True):
                 rows, columns, cost = pair_distances_px(first, second, a, b)
                 good = cost < 0.01 * np.hypot(*first.size_px)
-                points = _triangulated(
-                    first, second, a[rows[good]][:, wanted], b[columns[good]][:, wanted]
-                )
-                heads.append(points[:, 0])
-                feet.append(points[:, 1:].mean(1))
-    head, foot = np.concatenate(heads), np.concatenate(feet)
-    whole = np.isfinite(head + foot).all(axis=1)
-    return head[whole], foot[whole]
+                if good.any():
+                    found.append(_triangulated(first, second, a[rows[good]], b[columns[good]]))
+    return np.concatenate(found)
 
 
 def _triangulated(

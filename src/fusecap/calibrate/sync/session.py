@@ -235,8 +235,9 @@ def _filmed_take(
         landmarks=common_landmarks(alone),
         keypoints=tuple(tracks),
         imus=(),
+        samples={},
         times_s=solve_times_s(alone, tuple(tracks), []),
         findings=(),
         content_hash="",
     )
-    return solve_session(data, progress=progress).take
+    return solve_session(data, progress=progress, anyway=True).take

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from fusecap.errors import CalibrationError
-from fusecap.geometry.camera import Y_UP_FROM_Z_UP, Camera, Rig
+from fusecap.geometry.camera import Y_UP_FROM_Z_UP, Rig
 from fusecap.sources.calibration_files.formats import rig_formats
 from fusecap.sources.calibration_files.plausibility import MILLIMETRES_ABOVE, camera_spread
+from fusecap.sources.calibration_files.rig_format import StatedCamera
 
 Y_UP_FROM = {
     "y": np.eye(3),
@@ -20,17 +22,28 @@ Y_UP_FROM = {
 """Per up axis of a calibration's world, the rotation that brings it into ours."""
 
 
-def load_rig(path: Path | str, *, up: str = "y", unit: str = "m") -> Rig:
-    """All cameras of a calibration file or folder, in our y-up world in metres.
+def load_rig(
+    path: Path | str, *, up: str = "y", unit: str = "m", names: Sequence[str] | None = None
+) -> Rig:
+    """The cameras of a calibration file or folder, in our y-up world in metres.
+
+    With `names` only those; the others may be of any kind and unfinished.
 
     `up` is the up axis of the file's world ("y", "z" or "-y"). `unit` ("m" or "mm") is that of
     formats which leave it open; centimetres of Panoptic and millimetres of Qualisys are known.
     Raises `CalibrationError`, also for a calibration that is evidently not in the stated unit.
     """
     path = Path(path)
-    cameras, unit_is_open = _read(path)
-    if not cameras:
+    stated, unit_is_open = _read(path)
+    if not stated:
         raise CalibrationError(f"{path}: holds no camera; {_known()}")
+    cameras = [camera() for name, camera in stated if names is None or name in names]
+    if names is not None and {camera.name for camera in cameras} != set(names):
+        missing = [name for name in names if name not in {camera.name for camera in cameras}]
+        raise CalibrationError(
+            f"{path}: no camera {', '.join(map(repr, missing))}; "
+            f"it has {', '.join(name for name, _ in stated)}"
+        )
     if unit_is_open and unit == "mm":
         cameras = [replace(camera, translation=camera.translation / 1000) for camera in cameras]
     try:
@@ -66,7 +79,7 @@ def _known() -> str:
     return "expected " + " or ".join(format.what for format in rig_formats())
 
 
-def _read(path: Path) -> tuple[list[Camera], bool]:
+def _read(path: Path) -> tuple[list[StatedCamera], bool]:
     """The cameras, and whether the format leaves their unit open."""
     if not path.exists():
         raise CalibrationError(f"{path}: no such file or folder; {_known()}")

@@ -8,6 +8,9 @@ from pathlib import Path
 
 from fusecap.geometry.camera import Camera, Rig
 
+StatedCamera = tuple[str, Callable[[], Camera]]
+"""A name in a file, and what reads that camera or raises `CalibrationError`."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RigFormat:
@@ -19,8 +22,9 @@ class RigFormat:
     """Of file names; none: it is a folder."""
     unit_is_open: bool
     """Whether translations may be in metres or millimetres; else `read` gives metres."""
-    read: Callable[[Path], list[Camera] | None]
-    """The cameras; None where the file or folder is not in this format."""
+    read: Callable[[Path], list[StatedCamera] | None]
+    """The cameras, none judged before it is asked for; None where the file or folder is not in this
+    format."""
     texts: Callable[[Path, Rig, Sequence[str]], dict[Path, str]]
     """The files, for cameras in metres and notes of which a format without comments has none."""
 

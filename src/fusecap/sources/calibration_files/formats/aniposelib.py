@@ -20,6 +20,7 @@ and takes tables in alphabetical order, so their numbers have as many digits as 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,14 +30,14 @@ from fusecap.errors import CalibrationError
 from fusecap.geometry.camera import Camera, Rig
 from fusecap.inputs import CALIBRATION, read_toml
 from fusecap.sources.calibration_files import fields
-from fusecap.sources.calibration_files.rig_format import RigFormat
+from fusecap.sources.calibration_files.rig_format import RigFormat, StatedCamera
 from fusecap.sources.toml_text import quoted
 
 CALISCOPE_NAME = "camera_array.toml"
 """The one name under which caliscope looks for cameras, nested under `[cameras]`."""
 
 
-def read(path: Path) -> list[Camera] | None:
+def read(path: Path) -> list[StatedCamera] | None:
     """The cameras, translations in the file's unit; raises `CalibrationError`."""
     if path.suffix != ".toml" or path.is_dir():
         return None
@@ -49,7 +50,10 @@ def read(path: Path) -> list[Camera] | None:
         for key, value in data.items()
         if isinstance(value, dict) and "matrix" in value and value.get("ignore") is not True
     }
-    return [_camera(path, key, table) for key, table in tables.items()]
+    return [
+        (str(table.get("name", key)), partial(_camera, path, key, table))
+        for key, table in tables.items()
+    ]
 
 
 def dumps(cameras: Sequence[Camera], *, notes: Sequence[str] = (), nested: bool = False) -> str:

@@ -10,43 +10,50 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from fusecap.errors import CalibrationError
 from fusecap.geometry.camera import Camera, Rig
 from fusecap.sources.calibration_files import fields
-from fusecap.sources.calibration_files.rig_format import RigFormat
+from fusecap.sources.calibration_files.rig_format import RigFormat, StatedCamera
 
 METRES_PER_CENTIMETRE = 0.01
 
 
-def read(path: Path) -> list[Camera] | None:
+def read(path: Path) -> list[StatedCamera] | None:
     """The cameras, translations in metres; raises `CalibrationError`."""
     if path.suffix != ".json" or path.is_dir():
         return None
     data = fields.json_object(path)
     if not isinstance(data.get("cameras"), list):
         return None
-    cameras = []
-    for index, entry in enumerate(data["cameras"]):
-        where = f"{path}: cameras[{index}]"
-        keys = ("name", "resolution", "K", "R", "t")
-        missing = [key for key in keys if not isinstance(entry, dict) or key not in entry]
-        if missing:
-            raise CalibrationError(f"{where} has no {', '.join(missing)}")
-        translation = fields.numbers(entry["t"], (3,), f"{where} t")
-        cameras.append(
-            fields.camera(
-                path,
-                name=str(entry["name"]),
-                size_px=fields.numbers(entry["resolution"], (2,), f"{where} resolution"),
-                matrix=fields.numbers(entry["K"], (3, 3), f"{where} K"),
-                distortion=fields.distortion(entry.get("distCoef"), f"{where} distCoef"),
-                rotation=fields.numbers(entry["R"], (3, 3), f"{where} R"),
-                translation=translation * METRES_PER_CENTIMETRE,
-            )
-        )
-    return cameras
+    return [
+        (_name(entry), partial(_camera, path, f"{path}: cameras[{index}]", entry))
+        for index, entry in enumerate(data["cameras"])
+    ]
+
+
+def _name(entry: Any) -> str:
+    return str(entry.get("name", "")) if isinstance(entry, dict) else ""
+
+
+def _camera(path: Path, where: str, entry: Any) -> Camera:
+    keys = ("name", "resolution", "K", "R", "t")
+    missing = [key for key in keys if not isinstance(entry, dict) or key not in entry]
+    if missing:
+        raise CalibrationError(f"{where} has no {', '.join(missing)}")
+    translation = fields.numbers(entry["t"], (3,), f"{where} t")
+    return fields.camera(
+        path,
+        name=str(entry["name"]),
+        size_px=fields.numbers(entry["resolution"], (2,), f"{where} resolution"),
+        matrix=fields.numbers(entry["K"], (3, 3), f"{where} K"),
+        distortion=fields.distortion(entry.get("distCoef"), f"{where} distCoef"),
+        rotation=fields.numbers(entry["R"], (3, 3), f"{where} R"),
+        translation=translation * METRES_PER_CENTIMETRE,
+    )
 
 
 def dumps(cameras: Sequence[Camera]) -> str:

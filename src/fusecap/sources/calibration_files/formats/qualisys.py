@@ -4,11 +4,15 @@ R, p = transform r11..r33, x y z [mm]        p: the camera's centre
 rotation = diag(1, -1, -1) R                  its cameras look along -z with y up
 translation = -rotation p / 1000
 fx, fy, cx, cy = value / 64                   its pixels are cut into 64ths
+
+Videos of another `video_resolution` than the sensor's scale all of these.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -19,14 +23,14 @@ from fusecap.geometry.camera import Camera, Rig
 from fusecap.inputs import CALIBRATION
 from fusecap.sources import safe_xml
 from fusecap.sources.calibration_files import fields
-from fusecap.sources.calibration_files.rig_format import RigFormat
+from fusecap.sources.calibration_files.rig_format import RigFormat, StatedCamera
 
 SUFFIXES = (".qca.txt", ".qca")
 SUBPIXELS = 64.0
 _FLIP = np.diag([1.0, -1.0, -1.0])
 
 
-def read(path: Path) -> list[Camera] | None:
+def read(path: Path) -> list[StatedCamera] | None:
     """The active cameras, translations in metres; raises `CalibrationError`."""
     if not path.name.endswith(SUFFIXES) or path.is_dir():
         return None
@@ -35,7 +39,7 @@ def read(path: Path) -> list[Camera] | None:
     except safe_xml.XmlError as error:
         raise CalibrationError(f"{path}: {error}") from None
     return [
-        _camera(path, element)
+        (element.get("serial", ""), partial(_camera, path, element))
         for element in root.iterfind("./cameras/camera")
         if element.get("active", "1") == "1"
     ]
@@ -104,6 +108,8 @@ def _camera(path: Path, element: ElementTree.Element) -> Camera:
     if "fisheye" in element.get("model", "").lower():
         raise CalibrationError(f"{where} is a fisheye lens, which is not supported")
     left, top = value(view, "left"), value(view, "top")
+    size_px = np.array([value(view, "right") - left + 1, value(view, "bottom") - top + 1])
+    filmed = _filmed_lines(element) / size_px[1]
     in_file = np.array(
         [[value(transform, f"r{row}{column}") for column in (1, 2, 3)] for row in (1, 2, 3)]
     )
@@ -114,10 +120,15 @@ def _camera(path: Path, element: ElementTree.Element) -> Camera:
     matrix[1, 1] = value(intrinsic, "focalLengthV") / SUBPIXELS
     matrix[0, 2] = value(intrinsic, "centerPointU") / SUBPIXELS - left
     matrix[1, 2] = value(intrinsic, "centerPointV") / SUBPIXELS - top
+    if np.isfinite(filmed):
+        # The centre of the first pixel is at (0, 0) in either picture.
+        matrix[:2, 2] = (matrix[:2, 2] + 0.5) * filmed - 0.5
+        matrix[[0, 1], [0, 1]] *= filmed
+        size_px = np.round(size_px * filmed)
     return fields.camera(
         path,
         name=name,
-        size_px=np.array([value(view, "right") - left + 1, value(view, "bottom") - top + 1]),
+        size_px=size_px,
         matrix=matrix,
         distortion=np.array(
             [
@@ -131,6 +142,12 @@ def _camera(path: Path, element: ElementTree.Element) -> Camera:
         rotation=rotation,
         translation=-rotation @ centre_m,
     )
+
+
+def _filmed_lines(element: ElementTree.Element) -> float:
+    """Of the camera's videos, by `video_resolution="1080p"`; NaN where it states none."""
+    match = re.fullmatch(r"(\d+)p", element.get("video_resolution", ""))
+    return float(match.group(1)) if match else float("nan")
 
 
 def _attributes(element: ElementTree.Element, tag: str, where: str) -> dict[str, str]:

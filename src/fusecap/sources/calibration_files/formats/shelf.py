@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,17 +18,17 @@ import numpy as np
 from fusecap.errors import CalibrationError
 from fusecap.geometry.camera import Camera, Rig
 from fusecap.sources.calibration_files import fields
-from fusecap.sources.calibration_files.rig_format import RigFormat
+from fusecap.sources.calibration_files.rig_format import RigFormat, StatedCamera
 
 _FILE_NAME = re.compile(r"(?!calibration_)[^/\\:*?\"<>|\x00-\x1f]+")
 
 
-def read(path: Path) -> list[Camera] | None:
+def read(path: Path) -> list[StatedCamera] | None:
     """The cameras, translations in the file's unit; raises `CalibrationError`."""
     if path.is_dir():
         files = sorted(path.glob("*.json"))
         if any(not file.name.startswith("calibration_") for file in files):
-            return [_camera(file) for file in files]
+            return [(file.stem, partial(_camera, file)) for file in files]
     elif path.suffix == ".json" and {"K", "RT"} <= fields.json_object(path).keys():
         raise CalibrationError(
             f"{path}: is one camera of a folder; name the folder as the calibration"

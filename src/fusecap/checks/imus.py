@@ -21,7 +21,7 @@ def check_imus(
     """Of every sensor that could be read, and how it sits on its bone."""
     for subject in session.subjects:
         unmounted = []
-        for imu, track in zip(subject.imus, tracks[subject.name], strict=True):
+        for imu, track in zip(subject.imus, tracks.get(subject.name, ()), strict=True):
             if track is None:
                 continue
             where = f"imu '{imu.bone}' of '{subject.name}'"

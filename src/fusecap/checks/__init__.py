@@ -1,0 +1,5 @@
+"""What opened inputs say against themselves: one set of checks, for doctor and for solve."""
+
+from fusecap.checks.measurements import check_measurements
+
+__all__ = ["check_measurements"]
