@@ -33,7 +33,7 @@ def test_a_take_in_which_nobody_is_followed_is_an_error_and_not_written(scene, m
     text = (scene / "session.toml").read_text()
     (scene / "session.toml").write_text(text.split("[[subject]]")[0])
     assert run(monkeypatch, "solve", scene) == 1
-    assert "nobody could be followed" in capsys.readouterr().err
+    assert "no camera sees anyone" in capsys.readouterr().err
     assert not list(scene.glob("demo.npz"))
 
 
