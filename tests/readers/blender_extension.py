@@ -1,0 +1,71 @@
+"""Uses the extension as a person would: imports a take, receives a stream, bakes it.
+
+    python blender_extension.py EXTENSION_FOLDER TAKE.npz OUT.npz [ws://ADDRESS]
+
+EXTENSION_FOLDER holds the unpacked `fusecap_motion`. OUT receives, per armature, names and heads
+per frame in fusecap's axes: `import_*` of the take, `live_*` of the baked stream.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+
+import bpy
+import numpy as np
+
+Y_UP_FROM_BLENDER = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+
+
+def heads(armature, first: float, frames: int) -> np.ndarray:
+    found = np.empty((frames, len(armature.pose.bones), 3))
+    for frame in range(frames):
+        whole = int(np.floor(first + frame))
+        bpy.context.scene.frame_set(whole, subframe=first + frame - whole)
+        for index, bone in enumerate(armature.pose.bones):
+            world = np.array(armature.matrix_world @ bone.head)
+            found[frame, index] = Y_UP_FROM_BLENDER @ world
+    return found
+
+
+def people():
+    return [o for o in bpy.context.scene.objects if o.type == "ARMATURE"]
+
+
+def main() -> None:
+    folder, take, out = sys.argv[1:4]
+    sys.path.insert(0, folder)
+    import fusecap_motion
+
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.context.scene.render.fps = 60
+    fusecap_motion.register()
+    with np.load(take) as file:
+        frames = len(file["timestamps_ns"])
+    assert bpy.ops.import_anim.fusecap_take(filepath=take) == {"FINISHED"}
+    found = {}
+    for armature in people():
+        found[f"import_{armature.name}"] = heads(armature, 1, frames)
+        found[f"names_{armature.name}"] = np.array([b.name for b in armature.pose.bones])
+    if len(sys.argv) > 4:
+        for armature in people():
+            bpy.data.objects.remove(armature)
+        bpy.context.scene.fusecap_address = sys.argv[4]
+        bpy.context.scene.fusecap_record = True
+        assert bpy.ops.scene.fusecap_connect() == {"FINISHED"}
+        until = time.monotonic() + 3.0
+        while time.monotonic() < until:
+            fusecap_motion._timer()
+            time.sleep(0.02)
+        assert bpy.ops.scene.fusecap_disconnect() == {"FINISHED"}
+        for armature in people():
+            length = armature.animation_data.action.frame_range[1]
+            found[f"live_{armature.name}"] = heads(armature, 1, int(length))
+    fusecap_motion.unregister()
+    np.savez(out, **found)
+    print(json.dumps({"blender": bpy.app.version_string, "people": len(people())}))
+
+
+if __name__ == "__main__":
+    main()

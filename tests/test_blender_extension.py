@@ -1,0 +1,89 @@
+"""The Blender extension, from its zip, in a Blender without a window."""
+
+import contextlib
+import json
+import os
+import socket
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from export_people import NEAR_M, two_walkers, with_gap
+from fusecap.take import save_take
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture
+def extension(tmp_path) -> Path:
+    """The folder that holds the unpacked extension."""
+    build = ROOT / "integrations" / "blender" / "build.py"
+    told = subprocess.run(
+        [sys.executable, build, tmp_path], capture_output=True, text=True, check=True
+    )
+    archive = Path(told.stdout.removeprefix("wrote ").strip())
+    with zipfile.ZipFile(archive) as file:
+        assert {"__init__.py", "blender_manifest.toml"} <= {*file.namelist()}
+        file.extractall(tmp_path / "extension" / "fusecap_motion")
+    return tmp_path / "extension"
+
+
+@contextlib.contextmanager
+def streaming(take: Path):
+    """`fusecap stream` of a take, in a loop; gives the address."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    address = f"ws://127.0.0.1:{port}"
+    command = [sys.executable, "-m", "fusecap", "stream", take, "--to", address, "--loop"]
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
+        try:
+            for _ in range(300):
+                with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), 1):
+                    break
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(0.1)
+            yield address
+        finally:
+            process.terminate()
+
+
+@pytest.mark.slow
+def test_a_take_and_a_live_stream_become_armatures_that_move(tmp_path, extension):
+    python = os.environ.get("FUSECAP_BPY_PYTHON")
+    if not python:
+        pytest.skip("FUSECAP_BPY_PYTHON does not name a Python with bpy")
+    take = with_gap(two_walkers(60, names=("anna", "Zoë/2")), [20, 21])
+    save_take(take, tmp_path / "t.npz")
+    script = ROOT / "tests" / "readers" / "blender_extension.py"
+    out = tmp_path / "out.npz"
+    with streaming(tmp_path / "t.npz") as address:
+        run = subprocess.run(
+            [python, script, extension, tmp_path / "t.npz", out, address],
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=False,
+        )
+    assert run.returncode == 0, run.stderr
+    assert json.loads(run.stdout.splitlines()[-1])["people"] == 2
+    with np.load(out) as found:
+        for row, name in enumerate(take.subject_names):
+            names = found[f"names_{name}"].tolist()
+            assert {"left_pelvis", "left_clavicle"} <= {*names}
+            tracked = take.tracked[row]
+            live = found[f"live_{name}"]
+            assert len(live) > 60
+            for bone, bone_name in enumerate(take.bone_names):
+                true = take.bone_position_in_world_m[row, tracked, bone]
+                at = names.index(bone_name)
+                assert np.abs(found[f"import_{name}"][tracked, at] - true).max() < NEAR_M
+            # Of the stream, whatever instant each frame is: a pose of the take, or between two.
+            all_true = take.bone_position_in_world_m[row, tracked]
+            order = [names.index(n) for n in take.bone_names]
+            apart = np.abs(live[:, None, order] - all_true[None]).max(axis=(2, 3)).min(axis=1)
+            assert np.median(apart) < 0.02
