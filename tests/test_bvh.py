@@ -1,4 +1,5 @@
 import sys
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -17,12 +18,12 @@ from fusecap.cli import app
 from fusecap.cli.common import Exports, write_take
 from fusecap.errors import InputError, TakeError
 from fusecap.exports.euler import euler_rad
-from fusecap.exports.formats import FORMATS
+from fusecap.exports.formats import FORMATS, format_named
 from fusecap.exports.formats.bvh import _ORDERS, write_bvh
 from fusecap.exports.rigs import PRESETS
 from fusecap.exports.take_files import export, export_take
 from fusecap.exports.take_format import ExportOptions, TakeFormat
-from fusecap.take import save_take
+from fusecap.take import load_take, read_provenance, save_take
 from motions import any_poses, person, take_of, walk
 
 CONNECTING = {f"{side}_{bone}" for side in ("left", "right") for bone in ("pelvis", "clavicle")}
@@ -202,10 +203,25 @@ def test_odd_names_become_file_names_that_stay_apart(tmp_path):
     assert [p.name for p in paths] == [
         "my_take_______etc_x.bvh",
         "my_take_a_b.bvh",
-        "my_take_a_b_3.bvh",
+        "my_take_a_b_2.bvh",
         "my_take_unnamed.bvh",
         "my_take_Zoë.bvh",
     ]
+
+
+@pytest.mark.parametrize(
+    ("names", "files"),
+    [
+        (("p__3", "p?", "p!"), ["t_p__3.bvh", "t_p_.bvh", "t_p__2.bvh"]),
+        (("p__2", "p?", "p!"), ["t_p__2.bvh", "t_p_.bvh", "t_p__3.bvh"]),
+        (("Anna", "anna", "ANNA_2"), ["t_Anna.bvh", "t_anna_2.bvh", "t_ANNA_2_2.bvh"]),
+    ],
+)
+def test_no_two_people_share_a_file(tmp_path, names, files):
+    take = take_of(np.stack([walk(person(), 1)] * 3), [person()] * 3, names=names)
+    paths = export_take(take, tmp_path, format="bvh", stem="t")
+    assert [path.name for path in paths] == files
+    assert len({path.name.casefold() for path in tmp_path.iterdir()}) == 3
 
 
 def test_unknown_unit_is_refused(tmp_path):
@@ -237,7 +253,7 @@ def test_the_format_asked_for_is_the_one_written(tmp_path, monkeypatch):
     assert (tmp_path / "t_a.cm.note").read_text() == "('a',) cm"
     assert not list(tmp_path.glob("*.bvh"))
     again = tmp_path / "again.npz"
-    files = write_take(take, again, Exports(formats=["note", "bvh"]), picture=False)
+    files = solved_again(take, again, "note", "bvh")
     assert [path.name for path in files] == ["again.npz", "again_a.note", "again_a.bvh"]
 
 
@@ -260,25 +276,91 @@ def test_metres_and_centimetres_and_rigs_never_share_a_name(tmp_path):
     }
 
 
+def solved_again(take, target, *formats):
+    """The files of a solve that wrote this take."""
+    return write_take(take, target, Exports(formats=list(formats)), picture=False)
+
+
+def names_in(folder):
+    return {path.name for path in folder.iterdir()}
+
+
 def test_exports_of_an_earlier_solve_are_renamed_and_kept(tmp_path):
     target = tmp_path / "t.npz"
-    bvh = Exports(formats=["bvh"])
-    write_take(two_people(), target, bvh, picture=False)
+    solved_again(two_people(), target, "bvh")
     ben = (tmp_path / "t_ben.bvh").read_bytes()
     (tmp_path / "t_eva.bvh").write_text("somebody else's")
-    write_take(two_people(names=("anna", "carl")), target, bvh, picture=False)
+    solved_again(two_people(names=("anna", "carl")), target, "bvh")
     assert (tmp_path / "t_ben.earlier1.bvh").read_bytes() == ben
-    write_take(two_people(), target, Exports(formats=[]), picture=False)
-    assert {path.name for path in tmp_path.iterdir()} == {
+    assert load_take(target).provenance["exports"] == ["t_anna.bvh", "t_carl.bvh"]
+    solved_again(two_people(), target)
+    assert names_in(tmp_path) == {
         *("t.npz", "t_anna.earlier1.bvh", "t_ben.earlier1.bvh", "t_carl.earlier1.bvh"),
         "t_eva.bvh",
     }
 
 
+def test_inputs_that_share_the_name_of_a_take_stay_where_they_are(tmp_path):
+    """Sensor files of a session called walk, beside its take and what was exported from it."""
+    inputs = ("walk.csv", "walk.hips.csv", "walk.glb", "walk_anna.bvh", "walk.rig.npz")
+    for name in inputs:
+        (tmp_path / name).write_text("recorded")
+    for _ in range(2):
+        solved_again(two_people(), tmp_path / "walk.npz")
+    solved_again(two_people(), tmp_path / "walk.npz", "html")
+    solved_again(two_people(), tmp_path / "walk.npz")
+    assert names_in(tmp_path) == {*inputs, "walk.npz", "walk.earlier1.html"}
+    assert all((tmp_path / name).read_text() == "recorded" for name in inputs)
+
+
+@pytest.mark.parametrize("names", [5, {"t": 1}, ["../u.npz", "u_a.bvh", "/etc/x", 3, "t.npz/../u"]])
+def test_a_take_does_not_say_what_else_to_rename(tmp_path, names):
+    (tmp_path / "u_a.bvh").write_text("")
+    (tmp_path / "in").mkdir()
+    (tmp_path / "u.npz").write_text("")
+    save_take(replace(two_people(), provenance={"exports": names}), tmp_path / "in" / "t.npz")
+    solved_again(two_people(), tmp_path / "in" / "t.npz")
+    assert names_in(tmp_path) == {"u_a.bvh", "u.npz", "in"}
+    assert names_in(tmp_path / "in") == {"t.npz"}
+
+
+def test_no_export_of_an_earlier_take_stays_when_a_new_one_fails(tmp_path, monkeypatch):
+    """Neither one that the new solve did not want, nor one that it could not write."""
+    target = tmp_path / "t.npz"
+    solved_again(two_people(), target, "bvh", "csv", "html")
+    (tmp_path / "t.html").unlink()
+
+    def fails(take, path, options):
+        raise TakeError("the disk is full")
+
+    broken = replace(format_named("csv"), write=fails)
+    monkeypatch.setattr("fusecap.exports.formats.csv.FORMAT", broken)
+    with pytest.raises(TakeError, match="disk is full"):
+        solved_again(two_people(names=("anna", "carl")), target, "bvh", "csv")
+    left = {"t.npz", "t_anna.bvh", "t_carl.bvh", "t_ben.earlier1.bvh", "t.earlier1.csv"}
+    assert names_in(tmp_path) == left
+    assert load_take(target).subject_names == ("anna", "carl")
+
+
+def test_the_earlier_take_is_not_read_for_its_names(tmp_path):
+    shape = person()
+    theta = np.stack([walk(shape, 3000)] * 2)
+    solved_again(take_of(theta, [shape] * 2, names=("anna", "ben")), tmp_path / "t.npz", "html")
+    tracemalloc.start()
+    try:
+        assert read_provenance(tmp_path / "t.npz")["exports"] == ["t.html"]
+        assert tracemalloc.get_traced_memory()[1] < 1e6 < (tmp_path / "t.npz").stat().st_size
+    finally:
+        tracemalloc.stop()
+
+
 def test_export_goes_by_the_ending(tmp_path):
     both = two_people()
     paths = export(both, tmp_path / "x.bvh", unit="cm")
-    assert [path.name for path in paths] == ["x_anna.bvh", "x_ben.bvh"]
+    assert [path.name for path in paths] == ["x_anna.cm.bvh", "x_ben.cm.bvh"]
+    paths = export(both, tmp_path / "x.bvh", rig="mixamo")
+    assert [path.name for path in paths] == ["x_anna.mixamo.bvh", "x_ben.mixamo.bvh"]
+    assert export(both, tmp_path / "x.glb", rig="mixamo") == [tmp_path / "x.glb"]
     assert export(both.of_subjects([1]), tmp_path / "x.BVH") == [tmp_path / "x.BVH"]
     with pytest.raises(InputError, match=r"no format ends with '.bvg'; did you mean '.bvh'"):
         export(both, tmp_path / "x.bvg")

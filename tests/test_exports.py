@@ -4,7 +4,9 @@ import json
 import os
 import shutil
 import subprocess
+import sys
 import warnings
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -34,6 +36,7 @@ from fusecap.exports.rigs import PRESETS
 from fusecap.exports.take_files import export_all, export_take
 from fusecap.exports.take_format import ExportOptions
 from fusecap.feet import foot_events, standing
+from fusecap.geometry.camera import Rig
 from fusecap.sources.imu_files.formats.sto import FORMAT as STO
 from fusecap.take import save_take
 from motions import person, take_of, walk
@@ -284,8 +287,6 @@ def test_what_a_file_cannot_hold_goes_into_several(tmp_path, monkeypatch):
 
 
 def replaced_max(frames):
-    from dataclasses import replace
-
     return replace(format_named("c3d"), max_frames=frames)
 
 
@@ -584,10 +585,36 @@ def test_a_browser_plays_the_page_from_the_file(tmp_path):
 
 
 def test_a_library_that_is_missing_is_named_with_its_extra(tmp_path, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "ezc3d", None)
+    monkeypatch.setitem(sys.modules, "ezc3d", None)
     with pytest.raises(InputError, match=r"ezc3d.*pip install 'fusecap\[c3d\]'"):
         export_take(two_walkers(2), tmp_path, format="c3d", stem="t")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("format", "module", "told"),
+    [("c3d", "ezc3d", "fusecap[c3d]"), ("usd", "pxr", "fusecap[usd]"), ("fbx", "bpy", "Blender")],
+)
+@pytest.mark.parametrize("command", ["solve", "export"])
+def test_what_a_format_needs_is_asked_for_before_the_session_is_opened(
+    command, format, module, told, monkeypatch
+):
+    monkeypatch.setitem(sys.modules, module, None)
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.delenv("FUSECAP_BLENDER", raising=False)
+    monkeypatch.setattr("fusecap.exports.blender.find_spec", lambda name: None)
+    option = "--export" if command == "solve" else "--format"
+    result = CliRunner().invoke(app, [command, "nowhere", option, f"csv,{format}"])
+    assert isinstance(result.exception, InputError) and told in str(result.exception)
+
+
+def test_cameras_whose_names_are_one_on_disk_have_a_folder_each(tmp_path):
+    two = zip(demo_scene(0, seconds=0.1).rig.cameras, ("a/1", "A?1"), strict=False)
+    cameras = [replace(camera, name=name) for camera, name in two]
+    options = ExportOptions(cameras=Rig(cameras=tuple(cameras)))
+    (path,) = export_take(two_walkers(2), tmp_path, format="openpose", stem="t", options=options)
+    assert sorted(folder.name for folder in path.iterdir()) == ["A_1_2", "a_1"]
+    assert all(len(list(folder.iterdir())) == 2 for folder in path.iterdir())
 
 
 WITHOUT_MORE = [name for name in FORMATS if name not in ("fbx", "openpose")]

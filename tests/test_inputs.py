@@ -24,6 +24,7 @@ from fusecap.errors import FusecapError, InputError
 from fusecap.evaluate.datasets.safe_pickle import load_npz_object, load_pickle
 from fusecap.evaluate.datasets.shelf import load_truth, read_actors
 from fusecap.evaluate.scene_motion import load_motion
+from fusecap.exports.characters.character import read_character
 from fusecap.inputs import CALIBRATION, SETTINGS, TAKE, read_json, read_npz, read_toml
 from fusecap.recording.reader import Recording
 from fusecap.sources.calibration_files import load_rig
@@ -73,6 +74,7 @@ READERS = {
     "motion.bvh": load_motion,
     "motion.npz": load_motion,
     "network.onnx": open_network,
+    "character.glb": read_character,
     "truth.txt": load_truth,
     "truth.mat": read_actors,
     "data.pkl": load_pickle,

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -70,6 +71,17 @@ def safe_name(name: str) -> str:
     """`name` as part of a file name on any system: odd characters become underscores."""
     kept = "".join(c if c.isalnum() or c in "-_" else "_" for c in name.strip())
     return kept[:64] or "unnamed"
+
+
+def distinct_names(names: Iterable[str]) -> list[str]:
+    """`safe_name` of each, numbered so that no two are one file, whatever the system's case."""
+    distinct: dict[str, str] = {}
+    for name in names:
+        bare = safe_name(name)
+        tries = itertools.chain([bare], (f"{bare}_{number}" for number in itertools.count(2)))
+        free = next(each for each in tries if each.casefold() not in distinct)
+        distinct[free.casefold()] = free
+    return list(distinct.values())
 
 
 def plain(value: Any) -> Any:

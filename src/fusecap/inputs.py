@@ -63,6 +63,7 @@ TAKE = InputKind(what="a take (.npz)", most_bytes=4096 * _MB, error=TakeError)
 PRIOR = InputKind(what="a pose prior (.npz)", most_bytes=64 * _MB)
 BOARD = InputKind(what="a board (board.toml)", most_bytes=4 * _MB, error=CalibrationError)
 MOTION = InputKind(what="a motion file", most_bytes=256 * _MB)
+CHARACTER = InputKind(what="a character (.glb, .vrm)", most_bytes=1024 * _MB)
 NETWORK = InputKind(what="a network (.onnx or OpenVINO .xml)", most_bytes=2048 * _MB)
 DATASET = InputKind(what="a file of a data set", most_bytes=2048 * _MB)
 ARCHIVE = InputKind(what="a tar archive", most_bytes=None)
@@ -70,7 +71,7 @@ CELL = InputKind(what="a cell of an experiment", most_bytes=64 * _MB)
 
 KINDS = (
     *(SESSION, SETTINGS, CALIBRATION, BOARD, KEYPOINTS, DETECTION, SENSORS, POINTS, PICTURE),
-    *(VIDEO, RECORDING, TAKE, PRIOR, MOTION, NETWORK, DATASET, ARCHIVE, CELL),
+    *(VIDEO, RECORDING, TAKE, PRIOR, MOTION, CHARACTER, NETWORK, DATASET, ARCHIVE, CELL),
 )
 
 

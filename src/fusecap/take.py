@@ -402,6 +402,17 @@ def is_take(path: Path | str) -> bool:
         return False
 
 
+def read_provenance(path: Path | str) -> dict[str, Any]:
+    """What a take says of its making, and none of its motion; raises `TakeError`."""
+    try:
+        found = json.loads(str(read_npz(path, TAKE, ("provenance",))["provenance"]))
+    except (KeyError, ValueError, RecursionError) as error:
+        raise TakeError(f"{path}: the take does not say what made it ({error})") from None
+    if not isinstance(found, dict):
+        raise TakeError(f"{path}: the take does not say what made it")
+    return found
+
+
 def _stated_format(arrays: Mapping[str, np.ndarray]) -> str:
     return str(arrays.get("format", ""))
 

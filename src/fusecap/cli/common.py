@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -61,14 +62,6 @@ def named(option: str, text: str, expected: str) -> tuple[str, str]:
     return name, value
 
 
-def format_names(option: str, text: str) -> list[str]:
-    """The names of a comma-separated list, each checked."""
-    names = list(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
-    for name in names:
-        check_choice(option, name, tuple(FORMATS))
-    return names
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Exports:
     """What a command was asked to write beside a take."""
@@ -79,36 +72,60 @@ class Exports:
     options: ExportOptions | None = None
 
 
+def checked_exports(option: str, text: str, unit: str | None, rig: str) -> Exports:
+    """Of a comma-separated list of formats, checked before any work, with the libraries they need.
+
+    Names that are not known are misuse (exit code 2); the rest raises `InputError`.
+    """
+    from fusecap.exports.take_files import check_formats
+    from fusecap.exports.take_format import UNITS_PER_M
+
+    names = list(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
+    for name in names:
+        check_choice(option, name, tuple(FORMATS))
+    if unit is not None:
+        check_choice("--unit", unit, tuple(UNITS_PER_M))
+    check_choice("--rig", rig, tuple(PRESETS))
+    check_formats(names, unit=unit, rig=rig)
+    return Exports(formats=names, unit=unit, rig=rig)
+
+
 def write_take(
     take: Take, path: Path, exports: Exports, *, picture: bool, interrupted: bool = False
 ) -> list[Path]:
     """The take, its exports and its picture; exports of a take that stood there are set aside.
 
-    What an `interrupted` solve has goes beside `path`, by names of its own: a whole take stays.
+    The take's provenance lists its exports, so that the next solve knows them. What an
+    `interrupted` solve has goes beside `path`, by names of its own: a whole take stays.
     """
-    from fusecap.exports.take_files import export_all, set_aside
-    from fusecap.take import load_take, save_take
+    from fusecap.exports.take_files import plan_files
+    from fusecap.take import save_take
 
     if interrupted:
         path = path.with_name(f"{path.stem}-interrupted{path.suffix}")
-    try:
-        earlier = load_take(path).subject_names
-    except TakeError:
-        earlier = ()
+    planned = plan_files(
+        take,
+        path.parent,
+        formats=exports.formats,
+        stem=path.stem,
+        unit=exports.unit,
+        rig=exports.rig,
+        options=exports.options,
+    )
+    earlier = _exports_of(path)
+    again = {file.path for file in planned}
+    _set_aside(earlier - again)
+    if planned:
+        names = [file.path.name for file in planned]
+        take = replace(take, provenance={**take.provenance, "exports": names})
     save_take(take, path)
     files = [path]
-    if exports.formats:
-        files += export_all(
-            take,
-            path.parent,
-            formats=exports.formats,
-            stem=path.stem,
-            unit=exports.unit,
-            rig=exports.rig,
-            options=exports.options,
-        )
-    for aside in set_aside(path.stem, path.parent, earlier, files):
-        note(f"{aside.name} is of an earlier solve: renamed, and nothing of it was lost")
+    try:
+        for file in planned:
+            file.write(take)
+            files.append(file.path)
+    finally:
+        _set_aside((earlier & again).difference(files))
     frames = len(take.timestamps_ns)
     if picture and frames:
         from fusecap.exports.plot import plot_take
@@ -117,6 +134,27 @@ def write_take(
         plot_take(take, sorted({0, frames // 3, 2 * frames // 3, frames - 1}), image)
         files.append(image)
     return files
+
+
+def _exports_of(path: Path) -> set[Path]:
+    """What the take that stands there says was exported beside it."""
+    from fusecap.files import safe_name
+    from fusecap.take import read_provenance
+
+    try:
+        names = read_provenance(path).get("exports")
+    except TakeError:
+        return set()
+    ours = re.compile(re.escape(safe_name(path.stem)) + r"[_.][^/\\\0]+")
+    listed = names if isinstance(names, list) else []
+    return {path.with_name(str(name)) for name in listed if ours.fullmatch(str(name))}
+
+
+def _set_aside(paths: Iterable[Path]) -> None:
+    from fusecap.exports.take_files import set_aside
+
+    for aside in set_aside(sorted(paths)):
+        note(f"{aside.name} is of an earlier solve: renamed, and nothing of it was lost")
 
 
 def finish(solved: Solved, files: list[Path], as_json: bool) -> None:

@@ -7,10 +7,9 @@ from typing import Annotated
 
 import typer
 
-from fusecap.cli.common import Json, RigName, Unit, check_choice, format_names, print_json
+from fusecap.cli.common import Json, RigName, Unit, checked_exports, print_json
 from fusecap.cli.terminal import wrote
 from fusecap.exports.formats import FORMATS
-from fusecap.exports.rigs import PRESETS
 
 EXAMPLE = "Example: fusecap export take.npz --format bvh,glb --rig mixamo --out files"
 _FORMATS_HELP = "One, or several with commas. " + "; ".join(
@@ -39,14 +38,11 @@ def export(
     """
     from fusecap.batch.replay import open_take
     from fusecap.exports.take_files import export_all
-    from fusecap.exports.take_format import UNITS_PER_M, ExportOptions
+    from fusecap.exports.take_format import ExportOptions
     from fusecap.sources.session_cameras import common_landmarks, open_rig
     from fusecap.sources.session_file import load_session
 
-    formats = format_names("--format", format)
-    if unit is not None:
-        check_choice("--unit", unit, tuple(UNITS_PER_M))
-    check_choice("--rig", rig, tuple(PRESETS))
+    exports = checked_exports("--format", format, unit, rig)
     options = ExportOptions()
     if session is not None:
         loaded = load_session(session)
@@ -54,10 +50,10 @@ def export(
     files = export_all(
         open_take(take),
         out or take.parent,
-        formats=formats,
+        formats=exports.formats,
         stem=take.stem,
-        unit=unit,
-        rig=rig,
+        unit=exports.unit,
+        rig=exports.rig,
         options=options,
     )
     if as_json:

@@ -13,9 +13,8 @@ from fusecap.cli.common import (
     Json,
     RigName,
     Unit,
-    check_choice,
+    checked_exports,
     finish,
-    format_names,
     print_json,
     print_speed,
     write_take,
@@ -23,7 +22,6 @@ from fusecap.cli.common import (
 from fusecap.cli.terminal import console, note, progress, styled, table_of
 from fusecap.errors import InputError
 from fusecap.exports.formats import FORMATS
-from fusecap.exports.rigs import PRESETS
 
 if TYPE_CHECKING:
     from fusecap.batch.solve import Solved, SolveReport
@@ -81,8 +79,7 @@ def solve(
     from fusecap.sources.session_data import open_session
     from fusecap.sources.session_file import load_session
 
-    check_choice("--rig", rig, tuple(PRESETS))
-    exports = Exports(formats=format_names("--export", export or ""), unit=unit, rig=rig)
+    exports = checked_exports("--export", export or "", unit, rig)
     if session.suffix == SUFFIX:
         _solve_recording(session, out, exports, picture=picture, as_live=as_live, quiet=as_json)
         return
@@ -121,8 +118,9 @@ def _solve_recording(
     as_live: bool,
     quiet: bool,
 ) -> None:
-    from fusecap.batch.replay import solve_as_live
+    from fusecap.batch.replay import recorded_setup, solve_as_live
     from fusecap.batch.second_solve import solve_recording
+    from fusecap.exports.take_format import ExportOptions
     from fusecap.recording.reader import Recording
 
     ending = "-as-live.npz" if as_live else ".npz"
@@ -141,8 +139,14 @@ def _solve_recording(
             f"nobody could be followed in {solved.report.instants} instants of {path}; nothing "
             f"was written. What is in it: fusecap doctor {path}",
         )
+    setup = recorded_setup(recording)
+    seen = ExportOptions(cameras=setup.rig, landmarks=setup.landmarks)
     files = write_take(
-        solved.take, target, exports, picture=picture, interrupted=solved.report.interrupted
+        solved.take,
+        target,
+        replace(exports, options=seen),
+        picture=picture,
+        interrupted=solved.report.interrupted,
     )
     _print_solved(solved, files, replay, quiet)
 

@@ -23,7 +23,7 @@ VARIABLE = "FUSECAP_BLENDER"
 
 def run_in_blender(script: str, told: Mapping[str, Any], makes: Path) -> None:
     """Runs a script that knows `told`; raises `InputError` unless it made a file."""
-    command = _blender()
+    command = blender_command()
     text = f"import bpy, json\ntold = json.loads({json.dumps(dict(told))!r})\n{script}"
     try:
         run = subprocess.run([*command, text], capture_output=True, text=True, check=False)
@@ -34,7 +34,7 @@ def run_in_blender(script: str, told: Mapping[str, Any], makes: Path) -> None:
         raise InputError(f"{command[0]} wrote no {makes.suffix.upper()[1:]}: {last}")
 
 
-def _blender() -> list[str]:
+def blender_command() -> list[str]:
     """What runs a script that follows as the last argument."""
     named = os.environ.get(VARIABLE) or shutil.which("blender")
     if not named and find_spec("bpy") is not None:

@@ -8,19 +8,39 @@ are ever the same file.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from fusecap.errors import InputError, TakeError, nearest
 from fusecap.exports.formats import FORMATS, format_named
 from fusecap.exports.rigs import rig_preset
 from fusecap.exports.take_format import UNITS_PER_M, ExportOptions, TakeFormat
-from fusecap.files import safe_name
+from fusecap.files import distinct_names, safe_name
 from fusecap.take import Take
 
 _EARLIER = "earlier"
 """Put before the ending of a file that a new solve did not write again."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TakeFile:
+    """One file of an export, named before it is written."""
+
+    path: Path
+    format: TakeFormat
+    options: ExportOptions
+    rows: tuple[int, ...]
+    """Of the subjects in it."""
+    frames: tuple[int, int]
+    """From the first up to, and without, the second."""
+
+    def write(self, take: Take) -> None:
+        """Whole or not at all, of the take that it was planned for."""
+        part = take if len(self.rows) == len(take.subject_names) else take.of_subjects(self.rows)
+        if self.frames != (0, len(take.timestamps_ns)):
+            part = part.of_frames(*self.frames)
+        self.format.write(part, self.path, self.options)
 
 
 def export(
@@ -42,15 +62,13 @@ def export(
     if name is None:
         known = nearest(path.suffix, by_suffix)
         raise InputError(f"{path}: no format ends with '{path.suffix}'{known}")
-    format, chosen = _checked(name, unit, rig, options)
-    people = _people(take)
-    if not format.per_person or len(people) == 1:
-        one = take.of_subjects(people) if format.per_person else take
-        return _written(format, one, path, chosen)
-    paths: list[Path] = []
-    for one, safe in _one_by_one(take, people):
-        paths += _written(format, one, path.with_name(f"{path.stem}_{safe}{path.suffix}"), chosen)
-    return paths
+    format, settings = _checked(name, unit, rig, options)
+    if format.per_person and len(_people(take)) > 1:
+        ending = _unusual(format, settings) + path.suffix
+        files = _one_each(take, path.with_name(path.stem), ending, format, settings)
+    else:
+        files = _together(take, path, format, settings)
+    return write_files(take, files)
 
 
 def export_take(
@@ -68,21 +86,9 @@ def export_take(
     `unit`: the format's usual one unless told. Raises `InputError` for what is not known, and for
     a take with nobody in it.
     """
-    chosen, settings = _checked(format, unit, rig, options)
-    people = _people(take)
-    ending = ""
-    if chosen.has_rig and rig != "native":
-        ending += f".{rig}"
-    if settings.unit != chosen.units[0]:
-        ending += f".{settings.unit}"
-    ending += chosen.tag + chosen.suffix
-    base = Path(folder) / safe_name(stem)
-    if not chosen.per_person:
-        return _written(chosen, take, base.with_name(base.name + ending), settings)
-    paths: list[Path] = []
-    for one, safe in _one_by_one(take, people):
-        paths += _written(chosen, one, base.with_name(f"{base.name}_{safe}{ending}"), settings)
-    return paths
+    return write_files(
+        take, _planned(take, Path(folder) / safe_name(stem), *_checked(format, unit, rig, options))
+    )
 
 
 def export_all(
@@ -99,42 +105,72 @@ def export_all(
 
     Raises `InputError` where none of them has that choice, before anything is written.
     """
-    chosen = {name: _known_format(name) for name in formats}
-    if unit is not None and not any(unit in format.units for format in chosen.values()):
+    files = plan_files(
+        take, folder, formats=formats, stem=stem, unit=unit, rig=rig, options=options
+    )
+    return write_files(take, files)
+
+
+def plan_files(
+    take: Take,
+    folder: Path | str,
+    *,
+    formats: Sequence[str],
+    stem: str,
+    unit: str | None = None,
+    rig: str = "native",
+    options: ExportOptions | None = None,
+) -> list[TakeFile]:
+    """What `export_all` writes; raises as it does."""
+    chosen = check_formats(formats, unit=unit, rig=rig, options=options)
+    base = Path(folder) / safe_name(stem)
+    return [file for each in chosen for file in _planned(take, base, *each)]
+
+
+def check_formats(
+    formats: Sequence[str],
+    *,
+    unit: str | None = None,
+    rig: str = "native",
+    options: ExportOptions | None = None,
+) -> list[tuple[TakeFormat, ExportOptions]]:
+    """Each format and what is chosen for it.
+
+    Raises `InputError` for what is not known, for a choice that none of the formats has, and for a
+    library or program that one of them needs and that is not there.
+    """
+    known = {name: _known_format(name) for name in formats}
+    if known and unit is not None and not any(unit in format.units for format in known.values()):
         _checked(formats[0], unit, "native", options)
-    if rig != "native" and not any(format.has_rig for format in chosen.values()):
+    if known and rig != "native" and not any(format.has_rig for format in known.values()):
         _checked(formats[0], None, rig, options)
-    paths: list[Path] = []
-    for name, format in chosen.items():
-        paths += export_take(
-            take,
-            folder,
-            format=name,
-            stem=stem,
-            unit=unit if unit in format.units else None,
-            rig=rig if format.has_rig else "native",
-            options=options,
+    return [
+        _checked(
+            name,
+            unit if unit in format.units else None,
+            rig if format.has_rig else "native",
+            options,
         )
+        for name, format in known.items()
+    ]
+
+
+def write_files(take: Take, files: Iterable[TakeFile]) -> list[Path]:
+    """Writes what was planned for the take; returns the paths."""
+    paths: list[Path] = []
+    for file in files:
+        file.write(take)
+        paths.append(file.path)
     return paths
 
 
-def set_aside(stem: str, folder: Path, subjects: Sequence[str], kept: Sequence[Path]) -> list[Path]:
-    """Renames what an earlier take exported under this stem, but for the files just written.
+def set_aside(paths: Iterable[Path]) -> list[Path]:
+    """Renames those of an earlier take's exports that are there; returns the new paths.
 
-    `subjects` are the earlier take's. `duo_ben.bvh` becomes `duo_ben.earlier1.bvh`, so nobody takes
-    it for a result of the take beside it. Returns the new paths.
+    `duo_ben.bvh` becomes `duo_ben.earlier1.bvh`, so nobody takes it for a result of the take beside
+    it. Raises `TakeError` with the system's reason.
     """
-    base = safe_name(stem)
-    people = {f"{base}_{safe}" for safe in _safe_names(subjects)}
-    moved: list[Path] = []
-    for name in FORMATS:
-        format = format_named(name)
-        for path in sorted(folder.glob(f"{base}*{format.tag}{format.suffix}")):
-            first, *parts = path.name.split(".")
-            ours = first in people if format.per_person else first == base
-            if ours and path not in kept and not any(p.startswith(_EARLIER) for p in parts):
-                moved.append(_renamed(path))
-    return moved
+    return [_renamed(path) for path in paths if path.exists()]
 
 
 def _renamed(path: Path) -> Path:
@@ -166,6 +202,7 @@ def _checked(
     rig_preset(rig)
     if rig != "native" and not format.has_rig:
         raise InputError(f"{name} has no rig: export it without --rig {rig}")
+    format.check_needs()
     return format, replace(options or ExportOptions(), unit=unit or format.units[0], rig=rig)
 
 
@@ -176,32 +213,54 @@ def _people(take: Take) -> list[int]:
     return people
 
 
-def _one_by_one(take: Take, people: Sequence[int]) -> Iterator[tuple[Take, str]]:
-    """A take of each person, and a name for files that no other has."""
-    names = _safe_names(take.subject_names)
-    for row in people:
-        yield take.of_subjects([row]), names[row]
+def _planned(take: Take, base: Path, format: TakeFormat, options: ExportOptions) -> list[TakeFile]:
+    ending = _unusual(format, options) + format.tag + format.suffix
+    if format.per_person:
+        return _one_each(take, base, ending, format, options)
+    return _together(take, base.with_name(base.name + ending), format, options)
 
 
-def _safe_names(subjects: Sequence[str]) -> list[str]:
-    names: list[str] = []
-    for row, subject in enumerate(subjects):
-        name = safe_name(subject)
-        names.append(f"{name}_{row + 1}" if name in names else name)
-    return names
+def _unusual(format: TakeFormat, options: ExportOptions) -> str:
+    """What a made-up name says of a file that is not the usual one."""
+    rig = f".{options.rig}" if options.rig != "native" else ""
+    return rig + (f".{options.unit}" if options.unit != format.units[0] else "")
 
 
-def _written(format: TakeFormat, take: Take, path: Path, options: ExportOptions) -> list[Path]:
+def _together(take: Take, path: Path, format: TakeFormat, options: ExportOptions) -> list[TakeFile]:
+    people = _people(take)
+    rows = people if format.per_person else range(len(take.subject_names))
+    return _in_parts(take, path, format, options, tuple(rows))
+
+
+def _one_each(
+    take: Take, base: Path, ending: str, format: TakeFormat, options: ExportOptions
+) -> list[TakeFile]:
+    names = distinct_names(take.subject_names)
+    return [
+        file
+        for row in _people(take)
+        for file in _in_parts(
+            take, base.with_name(f"{base.name}_{names[row]}{ending}"), format, options, (row,)
+        )
+    ]
+
+
+def _in_parts(
+    take: Take, path: Path, format: TakeFormat, options: ExportOptions, rows: tuple[int, ...]
+) -> list[TakeFile]:
     """One file, or `x.part1.c3d`, `x.part2.c3d` where the format holds no more frames."""
-    frames = len(take.timestamps_ns)
-    step = format.max_frames or frames
-    if frames <= step:
-        format.write(take, path, options)
-        return [path]
-    paths: list[Path] = []
-    for first in range(0, frames, step):
-        part = take.of_frames(first, first + step)
-        if part.tracked.any():
-            paths.append(path.with_name(f"{path.stem}.part{first // step + 1}{path.suffix}"))
-            format.write(part, paths[-1], options)
-    return paths
+    count = len(take.timestamps_ns)
+    step = format.max_frames or count
+    if count <= step:
+        return [TakeFile(path=path, format=format, options=options, rows=rows, frames=(0, count))]
+    return [
+        TakeFile(
+            path=path.with_name(f"{path.stem}.part{first // step + 1}{path.suffix}"),
+            format=format,
+            options=options,
+            rows=rows,
+            frames=(first, min(first + step, count)),
+        )
+        for first in range(0, count, step)
+        if take.tracked[list(rows), first : first + step].any()
+    ]

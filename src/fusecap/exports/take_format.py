@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -30,6 +31,10 @@ class ExportOptions:
     """As the detector of those cameras names them."""
 
 
+def nothing_needed() -> None:
+    """A plain install is enough."""
+
+
 class WriteTake(Protocol):
     """Writes everybody in a take, whole or not at all; raises `InputError`."""
 
@@ -52,3 +57,5 @@ class TakeFormat:
     """A longer take goes into several files."""
     has_rig: bool = False
     """Whether joints have names and a rest pose that a preset can choose."""
+    check_needs: Callable[[], object] = nothing_needed
+    """Raises `InputError` for a library or program that is not there, and what to do."""

@@ -13,8 +13,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from fusecap.errors import InputError
-
-_MOST_BYTES = 1 << 30
+from fusecap.inputs import CHARACTER, read_bytes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,12 +89,7 @@ def read_character(path: Path) -> Character:
 
 
 def _read_glb(path: Path) -> tuple[dict[str, Any], bytes]:
-    try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise InputError(f"{path}: larger than 1 GiB")
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror or error}") from error
+    data = read_bytes(path, CHARACTER)
     if data[:4] != b"glTF":
         raise InputError(f"{path}: expected a binary glTF (.glb or .vrm)")
     at, tree, binary = 12, None, b""
@@ -110,7 +104,7 @@ def _read_glb(path: Path) -> tuple[dict[str, Any], bytes]:
             elif kind == b"BIN\0":
                 binary = chunk
             at += 8 + length
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: is damaged ({error})") from error
     if not isinstance(tree, dict):
         raise InputError(f"{path}: is damaged: it has no tree of nodes")

@@ -25,10 +25,7 @@ _MOST = 255
 
 def write_c3d(take: Take, path: Path, options: ExportOptions) -> None:
     """Writes the one subject of `take`, whole or not at all; raises `InputError` without ezc3d."""
-    try:
-        import ezc3d
-    except ImportError as error:
-        raise missing(error, extra="c3d") from error
+    ezc3d = _ezc3d()
     scale = UNITS_PER_M[options.unit]
     names, places = marker_positions_m(take, axes=False)
     tracked = take.tracked[0]
@@ -58,6 +55,15 @@ def write_c3d(take: Take, path: Path, options: ExportOptions) -> None:
     file.add_parameter("SUBJECTS", "LABEL_PREFIXES", [""])
     _add_events(file, take, subject)
     written_by_name(path, lambda part: file.write(str(part)))
+
+
+def _ezc3d() -> Any:
+    """The library, which has no types."""
+    try:
+        import ezc3d
+    except ImportError as error:
+        raise missing(error, extra="c3d") from error
+    return ezc3d
 
 
 def _rotations(take: Take, scale: float) -> np.ndarray:
@@ -90,5 +96,10 @@ def _add_events(file: Any, take: Take, subject: str) -> None:
 
 
 FORMAT = TakeFormat(
-    suffix=".c3d", write=write_c3d, per_person=True, units=("mm", "m"), max_frames=65535
+    suffix=".c3d",
+    write=write_c3d,
+    per_person=True,
+    units=("mm", "m"),
+    max_frames=65535,
+    check_needs=_ezc3d,
 )

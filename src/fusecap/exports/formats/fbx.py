@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-from fusecap.exports.blender import run_in_blender
+from fusecap.exports.blender import blender_command, run_in_blender
 from fusecap.exports.formats.glb import write_glb
 from fusecap.exports.library import written_by_name
 from fusecap.exports.take_format import ExportOptions, TakeFormat
@@ -44,4 +44,6 @@ def fbx_from_glb(glb: Path, path: Path, *, rate_hz: float, frames: int) -> None:
     written_by_name(path, convert)
 
 
-FORMAT = TakeFormat(suffix=".fbx", write=write_fbx, per_person=False, has_rig=True)
+FORMAT = TakeFormat(
+    suffix=".fbx", write=write_fbx, per_person=False, has_rig=True, check_needs=blender_command
+)

@@ -20,7 +20,7 @@ from fusecap.body.pose import landmarks_in_world
 from fusecap.errors import InputError, TakeError
 from fusecap.exports.openpose import write_frame
 from fusecap.exports.take_format import ExportOptions, TakeFormat
-from fusecap.files import safe_name
+from fusecap.files import distinct_names
 from fusecap.geometry.camera import Camera
 from fusecap.take import Take
 
@@ -36,8 +36,10 @@ def write_openpose(take: Take, path: Path, options: ExportOptions) -> None:
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         try:
-            for camera in options.cameras.cameras:
-                folder = part / safe_name(camera.name)
+            cameras = options.cameras.cameras
+            names = distinct_names(camera.name for camera in cameras)
+            for camera, name in zip(cameras, names, strict=True):
+                folder = part / name
                 folder.mkdir(parents=True)
                 for frame, people in enumerate(_seen(take, camera, landmarks)):
                     write_frame(folder, camera.name, frame, people[take.tracked[:, frame]])

@@ -126,5 +126,10 @@ def _matrices(rotation: np.ndarray, position: np.ndarray) -> Any:
 
 
 FORMAT = TakeFormat(
-    suffix=".usdc", write=write_usd, per_person=False, units=METRE_AND_CM, has_rig=True
+    suffix=".usdc",
+    write=write_usd,
+    per_person=False,
+    units=METRE_AND_CM,
+    has_rig=True,
+    check_needs=_pxr,
 )
