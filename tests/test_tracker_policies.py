@@ -43,11 +43,12 @@ class Stage:
         predicted=None,
         unseen_by: tuple[int, ...] = (),
         left: int | None = None,
+        lone: np.ndarray | None = None,
     ) -> list[TrackUpdate]:
         """One instant; the people seen with left and right exchanged come last in every view.
 
         Cameras that they are `unseen_by` look and detect nobody; where one camera is `left`, the
-        others do not even look.
+        others do not even look. `lone` is something that the first camera alone detects.
         """
         everyone = [*bodies, *(body[BODY25.mirror] for body in mirrored)]
         views = []
@@ -55,7 +56,11 @@ class Stage:
             keypoints = np.ones((len(everyone), len(SOMEBODY), 3))
             for n, body in enumerate(everyone):
                 keypoints[n, :, :2] = camera.project(body)
-            views.append(keypoints[:0] if c in unseen_by or left not in (None, c) else keypoints)
+            shown = keypoints[:0] if c in unseen_by or left not in (None, c) else keypoints
+            if lone is not None and c == 0:
+                pixels = np.column_stack([camera.project(lone), np.ones(len(lone))])
+                shown = np.concatenate([shown, pixels[None]])
+            views.append(shown)
         now_ns = round(self._frame * 1e9 / RATE_HZ)
         self._frame += 1
         looked = tuple(left in (None, c) for c in range(len(views)))
@@ -256,6 +261,47 @@ def test_one_camera_waits_while_nobody_stands_at_the_start_position():
     rig = ring_of_cameras(1)
     ann = Subject(name="ann", start_m=(0.0, 0.0))
     assert Stage(Tracker(rig, BODY25, subjects=[ann]), rig).show(aside(-2.0)) == []
+
+
+# ------------------------------------------------------------------------------------- hand over
+
+
+def astray(stage: Stage, seconds: float, *, lone: np.ndarray, body: np.ndarray):
+    updates = []
+    for _ in range(round(seconds * RATE_HZ)):
+        updates = stage.show(body, unseen_by=(0,), lone=lone)
+    return updates
+
+
+@pytest.mark.parametrize("options", [TrackerOptions(), TrackerOptions(max_subjects=1)])
+def test_subject_whom_one_view_leads_astray_is_the_newcomer_beside(options):
+    stage = Stage(Tracker(RIG, BODY25, options))
+    known = subjects_of(stage.hold(1.0, SOMEBODY))
+    updates = astray(stage, 1.0, lone=SOMEBODY, body=aside(0.6))
+    assert subjects_of(updates) == known
+    assert (updates[0].person[1:] >= 0).all(), "three views see the person"
+
+
+def test_newcomer_far_from_a_subject_whom_one_view_shows_is_somebody_else():
+    stage = Stage(Tracker(RIG, BODY25))
+    known = subjects_of(stage.hold(1.0, SOMEBODY))
+    found = subjects_of(astray(stage, 1.0, lone=SOMEBODY, body=aside(2.5)))
+    assert len(found) == 2 and known.items() < found.items()
+
+
+def test_bystander_measured_beside_a_subject_does_not_take_the_place():
+    stage = Stage(Tracker(RIG, BODY25, TrackerOptions(max_subjects=1)))
+    known = subjects_of(stage.hold(1.0, SOMEBODY))
+    stage.hold(1.0, SOMEBODY, aside(0.7))
+    assert subjects_of(stage.hold(5.0, aside(0.7))) == {}
+    assert subjects_of(stage.hold(0.5, SOMEBODY, aside(0.7))) == known
+
+
+def test_two_views_that_put_a_subject_where_nobody_can_have_gone_are_not_believed():
+    stage = Stage(Tracker(RIG, BODY25))
+    stage.hold(1.0, SOMEBODY)
+    (update,) = stage.show(aside(0.9), predicted={0: SOMEBODY}, unseen_by=(2, 3))
+    assert (update.person < 0).all()
 
 
 # ----------------------------------------------------------------------------------------- memory

@@ -25,11 +25,16 @@ class Matcher:
         self._mirror = mirror
 
     def match(
-        self, views: Views, expected: np.ndarray, young: np.ndarray, free: np.ndarray
+        self,
+        views: Views,
+        expected: np.ndarray,
+        young: np.ndarray,
+        free: np.ndarray,
+        looking: int,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Rows of detections (t, c) and triangulated landmarks (t, k, 3); `free` is updated.
 
-        Tracks (t,) that are `young` choose after everyone else.
+        Tracks (t,) that are `young` choose after everyone else; `looking` is how many cameras do.
         """
         o = self._options
         person = np.full((len(expected), len(views.cameras)), -1)
@@ -42,6 +47,8 @@ class Matcher:
         )
         if young.any():
             assign_each_view(distance, gate, views.camera_of, views.first, free, person)
+        if looking > 1:
+            self._leave_far_ones(person, distance)
         measured = self._check(views, person, distance, free)
 
         # Only what was not far from a prediction can be near the skeleton just measured.
@@ -57,6 +64,13 @@ class Matcher:
             # What looks like somebody already found, doubled or mirrored, is nobody else.
             free &= ~(again < o.candidates.consistency_m).any(axis=0)
         return person, measured
+
+    def _leave_far_ones(self, person: np.ndarray, distance: np.ndarray) -> None:
+        """A view that no other confirms must be as near as views are to each other."""
+        for t in np.flatnonzero((person >= 0).sum(axis=1) == 1):
+            camera = int(np.argmax(person[t] >= 0))
+            if distance[t, person[t, camera]] > self._options.candidates.consistency_m:
+                person[t, camera] = -1
 
     def _distance(self, views: Views, landmarks: np.ndarray, wanted: np.ndarray) -> np.ndarray:
         """Distance [m] (t, n) of tracks to detections, right way round or mirrored."""

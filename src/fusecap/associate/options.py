@@ -52,6 +52,12 @@ class TrackerOptions:
     """Mean relative difference of limb lengths up to which a returning person may be a missing
     subject when there also is room for a new one: statures differ by 4 % (one standard deviation),
     a triangulated limb by 10 % in one frame."""
+    doubt_s: float = 0.5
+    """A subject whom no two views have agreed on for so long may be the newcomer beside: one view
+    and a velocity lead half a metre astray by then."""
+    size_frames: int = 25
+    """Instants that a size is taken from: of fewer, seen by two views from afar, limbs are a
+    quarter off, and where somebody was says more."""
     memory_s: float = 60.0
     """How long an unnamed subject is remembered; named ones always are."""
     candidates: CandidateOptions = field(default_factory=CandidateOptions)

@@ -25,7 +25,8 @@ class Population:
 
     def begin(self, landmarks: np.ndarray, now_ns: int) -> Track:
         """A new track, tentative until it is established."""
-        track = Track(self._next_id, landmarks, self._anatomy.limb_lengths(landmarks), now_ns)
+        centre_m, limbs_m = self._anatomy.centre(landmarks), self._anatomy.limb_lengths(landmarks)
+        track = Track(self._next_id, landmarks, centre_m, limbs_m, now_ns)
         self._next_id += 1
         self.tracks.append(track)
         return track

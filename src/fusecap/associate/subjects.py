@@ -134,24 +134,35 @@ class Cast:
         ]
 
     def admit(self, tracks: Sequence[Track], now_ns: int) -> None:
-        """Give established newcomers inside the volume a subject's place while there is one."""
-        subjects = self.ids()
+        """Give established newcomers inside the volume a subject's place while there is one.
+
+        Whoever appears where a subject may be whom no two views see waits a moment: either the
+        subject is measured again, or the newcomer is who the subject was.
+        """
+        o, subjects = self._options, self.ids()
         newcomers = [
             track
             for track in tracks
             if track.track_id not in subjects
             and not track.dismissed
             and track.seen_ns == now_ns
-            and track.is_established(self._options)
+            and track.is_established(o)
             and self.inside(track)
         ]
         if not newcomers:
             return
-        known = [p for p in self._places if not p.live and (p.track or p.start_m)]
+        known = [p for p in self._places if p.track or p.start_m]
         cost = np.array([[self._claim(t, p) for p in known] for t in newcomers])
-        admitted = cheapest(cost.reshape(len(newcomers), len(known)))
+        cost = cost.reshape(len(newcomers), len(known))
+        open_s = [o.doubt_s if p.live else 0.0 for p in known]
+        silent_s = [(now_ns - p.track.triangulated_ns) * 1e-9 if p.track else 0.0 for p in known]
+        undecided = np.array(silent_s) < np.array(open_s)
+        settled = ~np.isfinite(cost[:, undecided]).any(axis=1)
+        newcomers = [newcomers[n] for n in np.flatnonzero(settled)]
+        cost = np.where(undecided, np.inf, cost)[settled]
+        admitted = cheapest(cost)
         for n, p in admitted:
-            self._admit_to(known[p], newcomers[n])
+            self._admit_to(known[p], newcomers[n], tracks)
         rest = [t for n, t in enumerate(newcomers) if n not in dict(admitted)]
         rest.sort(key=lambda t: (-t.frames, self._from_middle(t)))
         waiting = [p for p in self._places if not (p.live or p.track or p.start_m)]
@@ -160,7 +171,7 @@ class Cast:
             if not waiting:
                 waiting.append(Place(name=self._free_name(), named=False, start_m=None))
                 self._places.append(waiting[0])
-            self._admit_to(waiting.pop(0), track)
+            self._admit_to(waiting.pop(0), track, tracks)
 
     def _claim(self, track: Track, place: Place) -> float:
         """How badly a newcomer fits a waiting or missing subject [m]; infinite: not at all."""
@@ -173,22 +184,27 @@ class Cast:
                 return 0.0  # One camera gives no place to compare with.
             return away if away < o.start_radius_m else np.inf
         lost = place.track
-        if track.born_ns <= lost.seen_ns:
-            return np.inf  # Both were seen at once: two people.
-        away = np.nan_to_num(np.linalg.norm(centre - self._anatomy.centre(lost.landmarks)))
+        doubtful = lost.triangulated_ns < track.born_ns
+        if track.is_other_than(lost) or (place.live and not doubtful):
+            return np.inf
+        expected = self._anatomy.centre(lost.predict(track.born_ns, None))
+        away = np.nan_to_num(np.linalg.norm(track.born_m - expected))
         misfit = size_misfit(lost.limb_lengths_m(), track.limb_lengths_m())
-        reach = o.reach_m + 2 * o.reach_speed_m_s * (track.born_ns - lost.seen_ns) * 1e-9
-        optional = self._room() > 0 or any(p.track is None for p in self._places)
-        if optional and (misfit > o.size_tolerance or away > reach):
+        since_s = max(track.born_ns - lost.triangulated_ns, 0) * 1e-9
+        reach = o.reach_m + 2 * o.reach_speed_m_s * since_s
+        optional = place.live or self._room() > 0 or any(p.track is None for p in self._places)
+        sized = not place.live or min(track.frames, lost.frames) >= o.size_frames
+        if optional and ((sized and misfit > o.size_tolerance) or away > reach):
             return np.inf
         return float(away / reach + misfit / o.size_tolerance)
 
     @staticmethod
-    def _admit_to(place: Place, track: Track) -> None:
+    def _admit_to(place: Place, track: Track, everyone: Sequence[Track]) -> None:
+        """A place that was live is handed over: nobody follows there whom it had any more."""
         if place.track is not None:
-            track.track_id = place.track.track_id
-            track.limb_sum_m += place.track.limb_sum_m
-            track.limb_count += place.track.limb_count
+            if place.live:
+                place.track.replaced = True
+            track.becomes(place.track, everyone)
         place.track = track
         place.live = True
 

@@ -17,11 +17,19 @@ EXTRAPOLATION_S = 0.5
 """Velocity is worth this long: about a step of walking. Later a track waits where it is."""
 
 
+SURELY_APART = 3.0
+"""Instants: two skeletons of three views each do not lie thrice."""
+FEW_VIEWS_APART = 0.2
+"""What an instant counts in which one of the two rests on two views: these can be of two people."""
+
+
 class Track:
     """Landmarks with constant velocity, what was seen of them, and the body's measure."""
 
     __slots__ = (
         "alone_ns",
+        "beside",
+        "born_m",
         "born_ns",
         "dismissed",
         "frames",
@@ -30,6 +38,7 @@ class Track:
         "limb_sum_m",
         "missed_ns",
         "overlap_since_ns",
+        "replaced",
         "seen_ns",
         "strong_frames",
         "time_ns",
@@ -39,9 +48,16 @@ class Track:
     )
 
     def __init__(
-        self, track_id: int, landmarks: np.ndarray, limb_lengths_m: np.ndarray, now_ns: int
+        self,
+        track_id: int,
+        landmarks: np.ndarray,
+        centre_m: np.ndarray,
+        limb_lengths_m: np.ndarray,
+        now_ns: int,
     ) -> None:
         self.track_id = track_id
+        self.born_m = centre_m
+        """Where the torso was first seen (3,)."""
         self.born_ns = self.seen_ns = self.triangulated_ns = self.time_ns = now_ns
         self.landmarks = landmarks
         """At `time_ns` in the world [m] (k, 3), NaN where never seen."""
@@ -58,6 +74,10 @@ class Track:
         """For how long enough cameras have looked and not seen it."""
         self.alone_ns = 0
         """For how long two cameras or more have looked and no two seen it."""
+        self.beside: dict[Track, float] = {}
+        """Instants in which it and another were measured apart; of few views each counts less."""
+        self.replaced = False
+        """Whether another track turned out to be who this one was thought to be."""
         self.dismissed = False
         """Whether it was said not to be a subject."""
 
@@ -94,6 +114,20 @@ class Track:
         elif looking > 1:
             self.alone_ns += elapsed_ns
 
+    def is_other_than(self, other: Track) -> bool:
+        """Whether the two were measured apart at once, and so are two people."""
+        return self.beside.get(other, 0.0) >= SURELY_APART
+
+    def becomes(self, old: Track, everyone: Sequence[Track]) -> None:
+        """Take over the identity of a track that lost this person; who was not it still is not."""
+        self.track_id = old.track_id
+        self.limb_sum_m += old.limb_sum_m
+        self.limb_count += old.limb_count
+        for other in everyone:
+            if old in other.beside and other is not self:
+                met = max(other.beside[old], other.beside.get(self, 0.0))
+                other.beside[self] = self.beside[other] = met
+
     def is_established(self, options: TrackerOptions) -> bool:
         """Whether enough views saw it for long enough to be a person."""
         lasted_s = (self.triangulated_ns - self.born_ns) * 1e-9
@@ -114,6 +148,22 @@ def measure(tracks: Sequence[Track], limb_lengths_m: np.ndarray) -> None:
     for t, track in enumerate(tracks):
         track.limb_sum_m += lengths[t]
         track.limb_count += known[t]
+
+
+def part(
+    tracks: Sequence[Track], views: np.ndarray, centre_m: np.ndarray, apart_m: float, enough: int
+) -> None:
+    """Note who is measured beside whom: tracks, the `views` (t,) they rest on, torsos (t, 3).
+
+    Those farther than `apart_m` from each other, of `enough` views each, are two people.
+    """
+    away_m = np.linalg.norm(centre_m[:, None] - centre_m[None], axis=2)
+    for a, b in zip(*np.nonzero(np.triu(away_m > apart_m, 1)), strict=True):
+        first, second = tracks[a], tracks[b]
+        met = first.beside.get(second, 0.0)
+        if met < SURELY_APART:
+            strong = min(views[a], views[b]) >= enough
+            first.beside[second] = second.beside[first] = met + (1.0 if strong else FEW_VIEWS_APART)
 
 
 def absorb(

@@ -34,7 +34,7 @@ from fusecap.associate.one_view import find_again, follow, nearest_in_view
 from fusecap.associate.options import TrackerOptions
 from fusecap.associate.population import Population
 from fusecap.associate.subjects import Cast, Subject
-from fusecap.associate.track import Track, absorb, measure
+from fusecap.associate.track import Track, absorb, measure, part
 from fusecap.associate.views import MIN_COMMON, Views
 from fusecap.believable import believable_detections, believable_points, checked_moment
 from fusecap.body.landmarks import LandmarkSet
@@ -87,7 +87,9 @@ class Tracker:
         for t, track in enumerate(tracks):
             expected[t] = track.predict(now_ns, predicted.get(track.track_id))
         free = np.ones(len(views.rays), dtype=bool)
-        person, measured = self._matcher.match(views, expected, self._young(), free)
+        looking = int(self._looking.sum())
+        person, measured = self._matcher.match(views, expected, self._young(), free, looking)
+        self._doubt(person, measured, expected, free, now_ns)
         self._absorb(person, measured, expected, now_ns)
         if not self._single and free.any():
             person, measured = self._find(views, person, measured, free, now_ns)
@@ -109,6 +111,7 @@ class Tracker:
         self._population.forget(measured, self._cast.ids(), self._looking, elapsed_ns, now_ns)
         self._cast.forget(self._population.tracks, now_ns)
         self._cast.admit(self._population.tracks, now_ns)
+        self._population.tracks = [t for t in self._population.tracks if not t.replaced]
         self._last_ns = now_ns
         return self._report(views.local(person), measured, tracks, now_ns)
 
@@ -149,6 +152,25 @@ class Tracker:
         young = [t.track_id not in subjects and not t.is_established(self._options) for t in tracks]
         return np.array(young, dtype=bool)
 
+    def _doubt(
+        self,
+        person: np.ndarray,
+        measured: np.ndarray,
+        expected: np.ndarray,
+        free: np.ndarray,
+        now_ns: int,
+    ) -> None:
+        """Of few views, what lies where nobody can have gone is two people's, and nobody's then."""
+        o, count = self._options, (person >= 0).sum(axis=1)
+        for t in np.flatnonzero((count > 1) & (count < o.birth_views)):
+            away_m = np.linalg.norm(measured[t] - expected[t], axis=1)
+            away_m = away_m[np.isfinite(away_m)]
+            since_s = (now_ns - self._population.tracks[t].triangulated_ns) * 1e-9
+            reach_m = o.reach_m + o.reach_speed_m_s * since_s
+            if len(away_m) and float(np.median(away_m)) > reach_m:
+                free[person[t][person[t] >= 0]] = True
+                person[t], measured[t] = -1, np.nan
+
     def _absorb(
         self, person: np.ndarray, measured: np.ndarray, expected: np.ndarray, now_ns: int
     ) -> None:
@@ -162,6 +184,10 @@ class Tracker:
         measure(moving, self._anatomy.limb_lengths(measured[agreed]))
         for track, views in zip(moving, count[agreed], strict=True):
             self._count_frame(track, int(views), now_ns)
+        if len(moving) > 1:
+            centre = np.array([self._anatomy.centre(t.landmarks) for t in moving])
+            enough = min(self._options.birth_views, int(self._looking.sum()))
+            part(moving, count[agreed], centre, self._options.duplicate_m, enough)
 
     def _count_frame(self, track: Track, views: int, now_ns: int) -> None:
         track.triangulated_ns = now_ns
