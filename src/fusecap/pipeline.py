@@ -74,6 +74,8 @@ class Step:
 
     updates: tuple[TrackUpdate, ...]
     estimates: tuple[Estimate, ...]
+    notes: tuple[str, ...] = ()
+    """What a user should know, in words."""
 
 
 def observation_of(
@@ -92,7 +94,15 @@ def _own_sorter(setup: Setup) -> Sorter | None:
     """As the setup asks for it; None without cameras."""
     if not len(setup.rig):
         return None
-    named = [Subject(name=model.name, start_m=model.start_m) for model in setup.subjects]
+    bones = setup.skeleton.bone_names
+    named = [
+        Subject(
+            name=model.name,
+            start_m=model.start_m,
+            sensors=tuple(bones[bone] for bone in model.sites.bone),
+        )
+        for model in setup.subjects
+    ]
     if setup.associate == "paper":
         return PaperSorter(setup.rig, setup.landmarks, named)
     options = setup.tracker
@@ -130,6 +140,7 @@ class Pipeline:
         self._pool = pool
         self._estimators: dict[str, Estimator] = {}
         self._removed: set[str] = set()
+        self._notes: list[str] = []
         self._now_ns: int | None = None
         self._looked_ns: int | None = None
         """When a camera last looked, at the latest at the first instant."""
@@ -152,6 +163,7 @@ class Pipeline:
             if name in self._models
         }
         self._now_ns = detections.timestamp_ns
+        self._notes.clear()
         updates = self._sort(detections, readings)
         followed = [update for update in updates if update.state is not TrackState.TENTATIVE]
         work = []
@@ -171,6 +183,7 @@ class Pipeline:
         self._step = Step(
             updates=tuple(updates),
             estimates=tuple(estimate for estimate in results if estimate is not None),
+            notes=tuple(self._notes),
         )
         return self._step
 
@@ -274,7 +287,13 @@ class Pipeline:
                 points = estimator.predict(detections.timestamp_ns)
                 if points is not None:
                     predicted[estimator.track_id] = points
+            if isinstance(self._sorter, Tracker):
+                self._sorter.hear(readings)
             updates = self._sorter.update(detections, predicted, detections.timestamp_ns)
+            if isinstance(self._sorter, Tracker):
+                for name in self._sorter.paired_anew:
+                    self._estimators.pop(name, None)
+                    self._notes.append(f"{name} is somebody else than was followed: sensors say so")
         sorted_names = {update.name for update in updates}
         if self._looked_ns is None or detections.looked is None or any(detections.looked):
             self._looked_ns = detections.timestamp_ns

@@ -55,6 +55,9 @@ class TrackerOptions:
     doubt_s: float = 0.5
     """A subject whom no two views have agreed on for so long may be the newcomer beside: one view
     and a velocity lead half a metre astray by then."""
+    patience_s: float = 2.0
+    """How long a place of somebody with sensors waits for whom they fit, and a stated start
+    position counts for them: in that time people have moved differently."""
     size_frames: int = 25
     """Instants that a size is taken from: of fewer, seen by two views from afar, limbs are a
     quarter off, and where somebody was says more."""

@@ -15,6 +15,7 @@ import numpy as np
 from fusecap.associate.anatomy import Anatomy, size_misfit
 from fusecap.associate.matching import cheapest
 from fusecap.associate.options import TrackerOptions
+from fusecap.associate.sensor_vote import FITS, MARGIN, SOON_S, SURE_S, SensorVote
 from fusecap.associate.track import Track
 from fusecap.errors import SessionError
 from fusecap.geometry.camera import Rig
@@ -27,6 +28,8 @@ class Subject:
     name: str
     start_m: tuple[float, float] | None = None
     """World (x, z) at the first instant, or None: whoever is found."""
+    sensors: tuple[str, ...] = ()
+    """Bones that carry one, in the order of the subject's readings."""
 
 
 def check_distinct(subjects: Sequence[Subject]) -> None:
@@ -59,6 +62,7 @@ class Cast:
         self._anatomy = anatomy
         self._options = options
         self._places = [Place(name=s.name, named=True, start_m=s.start_m) for s in subjects]
+        self._begun_ns: int | None = None
         self._single = len(rig) == 1
         self.size = options.max_subjects or len(subjects) or sys.maxsize
         """Subjects there may be at most."""
@@ -133,13 +137,51 @@ class Cast:
             or (place.track and (now_ns - place.track.seen_ns) * 1e-9 <= o.memory_s)
         ]
 
-    def admit(self, tracks: Sequence[Track], now_ns: int) -> None:
+    def pair_anew(self, tracks: Sequence[Track], vote: SensorVote) -> list[str]:
+        """Give wearers the tracks that their sensors fit, where these are clearly others.
+
+        Everyone who is tracked may be who wears them. Returns whose track changed; the identity
+        stays with the place, so who is followed under it must be solved anew.
+        """
+        places = [p for p in self._places if p.live and p.track and p.name in vote.heard]
+        if not places:
+            return []
+        cost = np.array([[vote.misfit(t, p.name, SURE_S) for t in tracks] for p in places])
+        now = [tracks.index(p.track) for p in places if p.track in tracks]
+        if len(now) < len(places) or not np.isfinite(cost[range(len(places)), now]).all():
+            return []
+        best = dict(cheapest(np.where(cost < FITS, cost, np.inf)))
+        moves = {row: column for row, column in best.items() if column != now[row]}
+        gain = sum(cost[row, now[row]] - cost[row, column] for row, column in moves.items())
+        if not moves or gain < MARGIN * len(moves):
+            return []
+        followed = {p.name: p.track for p in self._places if p.live and p.track}
+        given = {places[row].name: tracks[column] for row, column in moves.items()}
+        freed = [followed[name] for name in given if followed[name] not in given.values()]
+        robbed = [n for n, t in followed.items() if n not in given and t in given.values()]
+        given.update({name: freed.pop() for name in robbed})
+        numbers = {name: followed[name].track_id for name in given}
+        spare = [t.track_id for t in given.values() if t not in followed.values()]
+        for place in self._places:
+            if place.name in given:
+                place.track = given[place.name]
+                place.track.track_id = numbers[place.name]
+        for track, number in zip(freed, spare, strict=True):
+            track.track_id = number
+        return list(given)
+
+    def admit(self, tracks: Sequence[Track], now_ns: int, vote: SensorVote) -> None:
         """Give established newcomers inside the volume a subject's place while there is one.
 
         Whoever appears where a subject may be whom no two views see waits a moment: either the
         subject is measured again, or the newcomer is who the subject was.
         """
         o, subjects = self._options, self.ids()
+        if self._begun_ns is None:
+            self._begun_ns = now_ns
+        for place in self._places:
+            if place.name in vote.heard and (now_ns - self._begun_ns) * 1e-9 > o.patience_s:
+                place.start_m = None
         newcomers = [
             track
             for track in tracks
@@ -166,12 +208,45 @@ class Cast:
         rest = [t for n, t in enumerate(newcomers) if n not in dict(admitted)]
         rest.sort(key=lambda t: (-t.frames, self._from_middle(t)))
         waiting = [p for p in self._places if not (p.live or p.track or p.start_m)]
+        rest, waiting = self._admit_wearers(rest, waiting, tracks, now_ns, vote)
         chosen = rest[: len(waiting) + max(self._room(), 0)]
         for track in sorted(chosen, key=lambda t: t.track_id):
             if not waiting:
                 waiting.append(Place(name=self._free_name(), named=False, start_m=None))
                 self._places.append(waiting[0])
             self._admit_to(waiting.pop(0), track, tracks)
+
+    def _admit_wearers(
+        self,
+        newcomers: list[Track],
+        waiting: list[Place],
+        tracks: Sequence[Track],
+        now_ns: int,
+        vote: SensorVote,
+    ) -> tuple[list[Track], list[Place]]:
+        """Places of whoever wears sensors go to whom they fit; who else may be admitted, and where.
+
+        A newcomer of whom sensors do not tell yet waits a while, then is admitted like others: who
+        was mistaken is paired anew later.
+        """
+        worn = [p for p in waiting if p.name in vote.heard]
+        if not worn or not newcomers:
+            return newcomers, waiting
+        cost = np.array([[vote.misfit(t, p.name, SOON_S) for p in worn] for t in newcomers])
+        named = set()
+        for n, w in cheapest(np.where(cost < FITS, cost, np.inf)):
+            others = np.concatenate([np.delete(cost[n], w), np.delete(cost[:, w], n)])
+            if not (others < cost[n, w] + MARGIN).any():
+                self._admit_to(worn[w], newcomers[n], tracks)
+                named.add(n)
+        waiting = [p for p in waiting if not p.live]
+        found = all(p.live for p in worn)
+        left = [
+            t
+            for n, t in enumerate(newcomers)
+            if n not in named and (found or (now_ns - t.born_ns) * 1e-9 >= self._options.patience_s)
+        ]
+        return left, waiting
 
     def _claim(self, track: Track, place: Place) -> float:
         """How badly a newcomer fits a waiting or missing subject [m]; infinite: not at all."""

@@ -33,13 +33,14 @@ from fusecap.associate.matching import Matcher
 from fusecap.associate.one_view import find_again, follow, nearest_in_view
 from fusecap.associate.options import TrackerOptions
 from fusecap.associate.population import Population
+from fusecap.associate.sensor_vote import SensorVote
 from fusecap.associate.subjects import Cast, Subject
 from fusecap.associate.track import Track, absorb, measure, part
 from fusecap.associate.views import MIN_COMMON, Views
 from fusecap.believable import believable_detections, believable_points, checked_moment
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.geometry.camera import Rig
-from fusecap.types import Detections, TrackState, TrackUpdate
+from fusecap.types import Detections, ImuReading, TrackState, TrackUpdate
 
 
 class Tracker:
@@ -63,6 +64,14 @@ class Tracker:
         self._limits_px = np.array([camera.size_px for camera in rig.cameras]).reshape(-1, 2)
         self._looking = np.ones(len(rig), dtype=bool)
         self._last_ns: int | None = None
+        self._vote = SensorVote(landmark_set, {s.name: s.sensors for s in subjects if s.sensors})
+        self._readings: Mapping[str, ImuReading] = {}
+        self.paired_anew: list[str] = []
+        """Whom sensors gave another track at the last instant."""
+
+    def hear(self, readings: Mapping[str, ImuReading]) -> None:
+        """What subjects' sensors say at the instant of the next `update`."""
+        self._readings = readings
 
     def update(
         self,
@@ -110,7 +119,13 @@ class Tracker:
         elapsed_ns = 0 if self._last_ns is None else now_ns - self._last_ns
         self._population.forget(measured, self._cast.ids(), self._looking, elapsed_ns, now_ns)
         self._cast.forget(self._population.tracks, now_ns)
-        self._cast.admit(self._population.tracks, now_ns)
+        everyone = self._population.tracks
+        rows = [row for row, track in enumerate(tracks) if track in everyone]
+        self._vote.hear(
+            [tracks[row] for row in rows], measured[rows], self._readings, elapsed_ns * 1e-9
+        )
+        self._cast.admit(everyone, now_ns, self._vote)
+        self.paired_anew = self._cast.pair_anew(everyone, self._vote)
         self._population.tracks = [t for t in self._population.tracks if not t.replaced]
         self._last_ns = now_ns
         return self._report(views.local(person), measured, tracks, now_ns)
@@ -281,6 +296,11 @@ class Tracker:
         person[0, 0] = chosen
         return person, measured
 
+    def _waits(self, track: Track, now_ns: int) -> bool:
+        """Whether sensors may still tell who a newcomer is."""
+        age_s = (now_ns - track.born_ns) * 1e-9
+        return bool(self._vote.heard) and age_s < self._options.patience_s
+
     def _report(
         self, person: np.ndarray, measured: np.ndarray, tracks: list[Track], now_ns: int
     ) -> list[TrackUpdate]:
@@ -296,7 +316,7 @@ class Tracker:
                 for track in self._population.tracks
                 if track.track_id not in subjects
                 and track.strong_frames > 0
-                and not track.is_established(self._options)
+                and (not track.is_established(self._options) or self._waits(track, now_ns))
                 and self._cast.inside(track)
             ]
         return [

@@ -148,7 +148,7 @@ def solve_instants(
     """Both passes over recorded instants."""
     started = time.perf_counter()
     pipeline = Pipeline(_with_window(setup, 1))
-    tracked = _first_pass(pipeline, instants, progress)
+    tracked = _first_pass(pipeline, instants, setup.rate_hz, progress)
     reprojection = Reprojection(setup.rig, setup.landmarks)
     builder = TakeBuilder(
         skeleton=setup.skeleton,
@@ -199,7 +199,7 @@ def solve_instants(
             statuses=dict(statuses),
             elapsed_s=time.perf_counter() - started,
             interrupted=interrupted,
-            notes=notes,
+            notes=(*notes, *tracked.notes),
         ),
     )
 
@@ -215,6 +215,7 @@ class _Tracked:
     updates: list[list[TrackUpdate]]
     shapes: dict[str, BodyShape]
     interrupted: bool
+    notes: tuple[str, ...]
 
 
 def _in_order(named: list[str], found: Collection[str]) -> list[str]:
@@ -222,14 +223,18 @@ def _in_order(named: list[str], found: Collection[str]) -> list[str]:
     return named + sorted(set(found) - set(named), key=lambda name: (len(name), name))
 
 
-def _first_pass(pipeline: Pipeline, instants: Instants, progress: Progress | None) -> _Tracked:
+def _first_pass(
+    pipeline: Pipeline, instants: Instants, rate_hz: float, progress: Progress | None
+) -> _Tracked:
     updates: list[tuple[TrackUpdate, ...]] = []
     names: dict[int, str] = {}
+    notes: list[str] = []
     interrupted = False
     try:
         for instant in range(len(instants)):
             step = pipeline.step(instants.detections(instant), instants.readings(instant))
             updates.append(step.updates)
+            notes += [f"{instant / rate_hz:.2f} s: {note}" for note in step.notes]
             for update in step.updates:
                 if update.state is not TrackState.TENTATIVE:
                     names[update.track_id] = update.name
@@ -241,6 +246,7 @@ def _first_pass(pipeline: Pipeline, instants: Instants, progress: Progress | Non
         updates=[_named(some, names) for some in updates],
         shapes={name: pipeline.estimator(name).shape for name in set(names.values())},
         interrupted=interrupted,
+        notes=tuple(notes),
     )
 
 

@@ -137,6 +137,7 @@ class Engine:
         readings = self._sensors.readings(now_ns)
         self._detections = self._cameras.detections(now_ns)
         self._step = self._pipeline.step(self._detections, readings)
+        self.notes.extend(self._step.notes)
         if self._live.poses == "ahead":
             return None
         if self._live.poses == "solved":

@@ -256,18 +256,25 @@ def _refuse(where: str, error: FusecapError) -> None:
     raise error
 
 
+TELLING_SENSORS = 3
+"""So many tell whose they are, by how limbs point."""
+
+
 def unplaced_wearers(session: Session) -> list[Finding]:
     """People who wear sensors but could be anyone the cameras find first."""
     if not session.cameras or len(session.subjects) < 2:
         return []
-    names = [s.name for s in session.subjects if s.imus and s.start_m is None]
+    names = [
+        s.name for s in session.subjects if 0 < len(s.imus) < TELLING_SENSORS and s.start_m is None
+    ]
     if not names:
         return []
     return [
         Finding(
             severity="warning",
             where="subjects",
-            found=f"{', '.join(names)}: sensors, but no start position to tell them apart by",
+            found=f"{', '.join(names)}: fewer than {TELLING_SENSORS} sensors, which do not tell "
+            "who wears them, and no start position",
             remedy="add start_m = [x, z], or sensors may be taken for another person's",
         )
     ]

@@ -1,0 +1,120 @@
+"""Sensors say who is who: at the start, after an exchange, and never without a margin."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fusecap.associate.sensor_vote import FITS, SensorVote
+from fusecap.associate.track import Track
+from fusecap.body.landmarks import landmark_set_named
+from fusecap.evaluate.imu_noise import IMUS_6
+from fusecap.evaluate.simulated_solve import setup_of_simulation
+from fusecap.evaluate.simulator import Simulation
+from fusecap.pipeline import Pipeline
+from fusecap.solve.options import SolverOptions
+from fusecap.types import ImuReading
+from live_scene import capture
+
+RATE_HZ = 60
+
+
+@pytest.fixture(scope="module")
+def simulation() -> Simulation:
+    """Two subjects with 13 sensors each, and a bystander."""
+    return capture(5.0, synchronous=True)
+
+
+def pipeline_of(simulation: Simulation, *, backwards: bool = False) -> Pipeline:
+    """Without start positions, subjects in either order."""
+    setup = setup_of_simulation(simulation, options=SolverOptions(window=1))
+    subjects = [replace(model, start_m=None) for model in setup.subjects]
+    return Pipeline(replace(setup, subjects=tuple(subjects[::-1] if backwards else subjects)))
+
+
+def wrong_names(simulation, pipeline, instants, change=lambda instant, readings: readings):
+    """Instants and names of people who were solved where somebody else stands; notes."""
+    wrong, notes, seen = [], [], {}
+    truth = simulation.truth
+    for instant in instants:
+        readings = {name: rows[instant] for name, rows in simulation.imu_readings.items()}
+        step = pipeline.step(simulation.detections[instant], change(instant, readings))
+        notes += step.notes
+        for estimate in step.estimates:
+            true_m = truth.bone_position_in_world_m[:, instant, 0]
+            away_m = np.linalg.norm(true_m - estimate.bone_position_in_world_m[0], axis=1)
+            seen.setdefault(estimate.name, instant)
+            if truth.subject_names[int(np.argmin(away_m))] != estimate.name or away_m.min() > 0.3:
+                wrong.append((instant, estimate.name))
+    return wrong, notes, seen
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backwards", [False, True])
+@pytest.mark.parametrize("bones", [None, IMUS_6])
+def test_sensors_find_their_wearers_within_a_second_of_being_seen(simulation, backwards, bones):
+    worn = simulation if bones is None else simulation.subset(imu_bones=bones)
+    pipeline = pipeline_of(worn, backwards=backwards)
+    wrong, notes, seen = wrong_names(worn, pipeline, range(90))
+    assert not wrong and not notes
+    assert set(seen) == {"anna", "ben"} and max(seen.values()) <= RATE_HZ
+
+
+@pytest.mark.slow
+def test_people_who_exchange_their_sensors_exchange_their_names_with_a_note(simulation):
+    def change(instant, readings):
+        if instant < 120:
+            return readings
+        return {"anna": readings["ben"], "ben": readings["anna"]}
+
+    pipeline = pipeline_of(simulation)
+    wrong, notes, _ = wrong_names(simulation, pipeline, range(240), change)
+    exchanged = {instant for instant, _ in wrong}
+    assert set(range(120 + RATE_HZ, 240)) <= exchanged, "within a second anna is ben"
+    assert not exchanged & set(range(120))
+    assert len(notes) == 2 and all("sensors say so" in note for note in notes)
+
+
+@pytest.mark.slow
+def test_sensors_that_nobody_wears_keep_nobody_out_for_ever(simulation):
+    rng = np.random.default_rng(0)
+
+    def change(instant, readings):
+        turns = np.linalg.qr(rng.standard_normal((13, 3, 3)))[0]
+        nonsense = ImuReading(bone_rotation_in_world=turns, accel_in_world_m_s2=np.zeros((13, 3)))
+        return dict.fromkeys(readings, nonsense)
+
+    *_, seen = wrong_names(simulation, pipeline_of(simulation), range(200), change)
+    assert set(seen) == {"anna", "ben"}
+
+
+def test_two_who_do_the_same_are_not_told_apart():
+    landmarks = landmark_set_named("body25")
+    bones = ("hips", "left_forearm", "right_forearm", "left_shank")
+    vote = SensorVote(landmarks, {"anna": bones, "ben": bones})
+    from fusecap.associate.sensor_vote import _at_rest
+
+    standing = _at_rest(landmarks)
+    tracks = [Track(n, standing + [n, 0, 0], standing[0], np.zeros(1), 0) for n in range(2)]
+    still = ImuReading(
+        bone_rotation_in_world=np.tile(np.eye(3), (4, 1, 1)), accel_in_world_m_s2=np.zeros((4, 3))
+    )
+    for _ in range(60):
+        vote.hear(
+            tracks,
+            np.stack([t.landmarks for t in tracks]),
+            dict.fromkeys(("anna", "ben"), still),
+            1 / 60,
+        )
+    misfits = [vote.misfit(track, name, 0.5) for track in tracks for name in ("anna", "ben")]
+    np.testing.assert_allclose(misfits, 0.0, atol=0.05)
+    assert max(misfits) < FITS
+    assert np.isnan(vote.misfit(tracks[0], "anna", 2.0)), "not heard for so long"
+
+
+def test_too_few_sensors_have_no_vote():
+    vote = SensorVote(landmark_set_named("body25"), {"anna": ("hips", "left_hand", "head")})
+    vote.hear([], np.zeros((0, 25, 3)), {}, 0.0)
+    assert not vote.heard
