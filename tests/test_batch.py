@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from fusecap.batch.solve import Solved, solve_session
-from fusecap.doctor import diagnose
 from fusecap.errors import CalibrationError, InputError, SessionError
 from fusecap.evaluate.demo_scene import demo_scene
 from fusecap.evaluate.score import score_take
