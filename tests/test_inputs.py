@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import io
 import os
+import time
 import tracemalloc
 import zipfile
 from pathlib import Path
@@ -152,6 +153,84 @@ def test_numbers_of_many_digits_are_refused(name, digits, tmp_path):
     path.write_text(f"a = {number}" if name.endswith(".toml") else f'{{"people": [{number}]}}')
     with pytest.raises(FusecapError, match=r"whole number|digits|broken"):
         READERS[name](path)
+
+
+@pytest.mark.parametrize("name", ["a folder", "a pipe", "a device"])
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="no /proc")
+def test_what_is_refused_is_closed(name, tmp_path):
+    path = tmp_path / "x.toml"
+    if name == "a folder":
+        path.mkdir()
+    elif name == "a pipe":
+        os.mkfifo(path)
+    else:
+        path.symlink_to("/dev/null")
+    before = len(os.listdir("/proc/self/fd"))
+    for _ in range(20):
+        with pytest.raises(InputError, match=f"is {name}"):
+            read_toml(path, SETTINGS)
+    assert len(os.listdir("/proc/self/fd")) == before
+
+
+_LONG = "a" + ".a" * 20_000
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f'"\u2028# ".{_LONG} = 1',
+        f'x = ["""\n# """, {{{_LONG} = 1}}]',
+        f'x = ["""a"""", {{{_LONG} = 1}}]',
+        f"x = ['''\n# a'''', {{{_LONG} = 1}}]",
+        f'x = ["\\"", {{{_LONG} = 1}}] # "',
+        f"[ {_LONG} ]\nx = 1",
+        "1" + ".1" * 20_000 + " = 1",
+        " . ".join(["'a'", '"b"', "c"] * 7_000) + " = 1",
+        "[" + "a." * 3_000 + "a]\n" + "".join(f"b{n} = 1\n" for n in range(1000)),
+    ],
+    ids=range(9),
+)
+def test_no_key_of_many_parts_hides(text, tmp_path):
+    """Behind what looks like a comment or a string, or as numbers."""
+    path = tmp_path / "long.toml"
+    path.write_text(text, encoding="utf-8")
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match="so many parts"):
+            read_toml(path, SETTINGS)
+        assert tracemalloc.get_traced_memory()[1] < 50e6
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "x = [" + "1.5, " * 20_000 + "]",
+        "[a.b.c]\nx = [" + "[1.5, -2.5e-3],\n" * 10_000 + "]",
+        "x = '" + "a." * 50_000 + "'",
+        'x = """\n' + "a.b\n" * 50_000 + '"""',
+        "x = 1 # " + "a." * 50_000,
+        "d = [" + "2026-01-01T00:00:00.5, " * 5_000 + "]",
+    ],
+    ids=["one line of floats", "rows", "text", "long text", "comment", "dates"],
+)
+def test_dots_that_join_no_names_are_free(text, tmp_path):
+    path = tmp_path / "fine.toml"
+    path.write_text(text)
+    assert read_toml(path, SETTINGS)
+
+
+@pytest.mark.parametrize(
+    "piece", ['"\\"', "\\", '"', "'", '"""\\', "'''a", "a.", "a .", "#", "[a."]
+)
+def test_the_search_for_keys_takes_time_by_length_alone(piece, tmp_path):
+    path = tmp_path / "odd.toml"
+    path.write_text("x = " + piece * (1_000_000 // len(piece)))
+    started = time.process_time()
+    with pytest.raises(InputError):
+        read_toml(path, SETTINGS)
+    assert time.process_time() - started < 5
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ import io
 import json
 import math
 import os
+import re
 import stat
 import tomllib
 import zipfile
@@ -29,9 +30,20 @@ from fusecap.errors import CalibrationError, InputError, SessionError, TakeError
 MOST_NESTED = 64
 """Tables and lists inside each other, in TOML and JSON."""
 MOST_KEY_PARTS = 10_000_000
-"""Dots of a TOML file times those of its fullest line: 80 MB of its parser's memory."""
+"""Dots in keys of a TOML file times those of its longest: 80 MB of its parser's memory."""
 MOST_ENTRIES = 1000
 """In a zip file."""
+
+_PART = r"""(?:[\w-]+|"(?:\\[^\n]|[^"\\\n])*"?|'[^'\n]*'?)"""
+_KEY_PART = re.compile(_PART)
+_TOML_TOKEN = re.compile(
+    r'"""(?:\\.|[^\\])*?(?:"{3,5}|\Z)'
+    r"|'''.*?(?:'{3,5}|\Z)"
+    r"|#[^\n]*"
+    rf"|(?P<key>{_PART}(?:[ \t]*\.[ \t]*{_PART})*)(?P<named>[ \t]*[=\]])?",
+    re.DOTALL,
+)
+"""Long strings, comments, and keys or values; a string that never ends is one to its line's end."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,7 +91,7 @@ def open_input(path: Path | str, kind: InputKind) -> io.BufferedReader:
     """The file, open for reading; raises `kind.error` for anything that is not such a file."""
     flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
     try:
-        file = os.fdopen(os.open(path, flags), "rb")
+        handle = os.open(path, flags)
     except FileNotFoundError:
         raise kind.error(f"{path}: no such file; expected {kind.what}") from None
     except IsADirectoryError:
@@ -87,11 +99,11 @@ def open_input(path: Path | str, kind: InputKind) -> io.BufferedReader:
     except (OSError, ValueError) as error:
         raise kind.error(f"{path}: cannot be read: {_reason(error)}") from None
     try:
-        _check(path, kind, os.fstat(file.fileno()))
+        _check(path, kind, os.fstat(handle))
+        return os.fdopen(handle, "rb")
     except BaseException:
-        file.close()
+        os.close(handle)
         raise
-    return file
 
 
 def check_input(path: Path | str, kind: InputKind) -> None:
@@ -125,15 +137,23 @@ def read_text(path: Path | str, kind: InputKind, *, strict: bool = True) -> str:
 def read_toml(path: Path | str, kind: InputKind) -> dict[str, Any]:
     """The tables of a TOML file; raises `kind.error`, also for whole numbers beyond 64 bits."""
     text = read_text(path, kind)
-    dots = [line.count(".") for line in text.splitlines() if not line.lstrip().startswith("#")]
-    if max(dots, default=0) * sum(dots) > MOST_KEY_PARTS:
-        raise kind.error(
-            f"{path}: a line with {max(dots)} dots; keys of so many parts are not read"
-        )
+    dots = _dots_of_keys(text)
+    most = max(dots, default=0)
+    if most > MOST_NESTED or most * sum(dots) > MOST_KEY_PARTS:
+        raise kind.error(f"{path}: a key with {most} dots; keys of so many parts are not read")
     try:
         return _bounded(path, kind, tomllib.loads(text))
     except (ValueError, RecursionError) as error:
         raise kind.error(f"{path}: not valid TOML: {_reason(error)}") from None
+
+
+def _dots_of_keys(text: str) -> list[int]:
+    """Of each key of a TOML text, in time that grows with its length alone."""
+    return [
+        len(_KEY_PART.findall(token["key"])) - 1
+        for token in _TOML_TOKEN.finditer(text)
+        if token["named"] is not None
+    ]
 
 
 def read_json(path: Path | str, kind: InputKind) -> Any:
