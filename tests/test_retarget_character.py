@@ -124,7 +124,7 @@ def test_feet_stand_where_they_stood_on_other_legs(tmp_path, rig):
         theirs = found[names[f"{side}_foot"]]
         expected = done.scale * (ours - [0, 0.039 * 1.6, 0]) + [0, ankle_m, 0]
         stands = standing(locked, 0, side)
-        assert stands.any() and np.abs(theirs - expected)[stands].max() < 8e-3
+        assert stands.any() and np.abs(theirs - expected)[stands].max() < NEAR_M
         slides = [np.linalg.norm(np.diff(place, axis=0), axis=1) for place in (ours, theirs)]
         more = slides[1] - done.scale * slides[0]
         assert more[stands[1:] & stands[:-1]].max() < NEAR_M

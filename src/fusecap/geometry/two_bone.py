@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-_STRETCHED = 0.9995
+STRETCHED = 0.9995
 """It reaches no further than this share of its length."""
 
 
@@ -28,7 +28,7 @@ def two_bone_turns(
     reach = np.clip(
         np.linalg.norm(target - root, axis=1),
         np.abs(upper - lower) * 1.001,
-        (upper + lower) * _STRETCHED,
+        (upper + lower) * STRETCHED,
     )
     along = _unit(target - root)
     beside = _across(middle - root, along)

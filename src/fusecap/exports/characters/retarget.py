@@ -28,7 +28,7 @@ from fusecap.exports.formats.fbx import fbx_from_glb
 from fusecap.exports.gltf import Gltf
 from fusecap.exports.rig_motion import RigMotion, rig_motion, short_way
 from fusecap.exports.rigs import PRESETS
-from fusecap.geometry.two_bone import least_turns, two_bone_turns
+from fusecap.geometry.two_bone import STRETCHED, least_turns, two_bone_turns
 from fusecap.take import Take
 
 _CHILD = {
@@ -128,7 +128,9 @@ class _Moved:
         self._ours_m = dict(zip(rest.names, places, strict=True))
         self._ours = dict(zip(rest.names, turns, strict=True))
         theirs_m = {bone: character.world_position_m[node] for bone, node in mapped.bones.items()}
-        self.scale = _leg_m(theirs_m, character) / _leg_m(self._rest_m, character)
+        self._leg_m = _legs_m(theirs_m, character)
+        ours = _legs_m(self._rest_m, character)
+        self.scale = sum(self._leg_m.values()) / sum(ours.values())
         self._ankle_m = (theirs_m["left_foot"][1] + theirs_m["right_foot"][1]) / 2
         self._our_ankle_m = (self._rest_m["left_foot"][1] + self._rest_m["right_foot"][1]) / 2
         left = theirs_m["left_thigh"] - theirs_m["right_thigh"]
@@ -139,6 +141,7 @@ class _Moved:
         """By node."""
         self._turn_bones(mapped)
         self._hips_m = self._place_hips_m()
+        self._hips_m[:, 1] -= self._too_high_m()
         for side in ("left", "right"):
             self._reach(side)
 
@@ -210,6 +213,18 @@ class _Moved:
         away = np.mean(rest, axis=0) - character.world_position_m[hips]
         return middle - self.turns[hips] @ (character.world_rotation[hips].T @ away)
 
+    def _too_high_m(self) -> Float[np.ndarray, " t"]:
+        """How far the hips must sink for both legs to reach: wider hips ask for longer legs."""
+        above = np.zeros(self.frames)
+        for side in ("left", "right"):
+            hip = self._place_m(self._bones[f"{side}_thigh"])
+            away = hip - self._belongs_m(f"{side}_foot")
+            aside = (away[:, [0, 2]] ** 2).sum(axis=1)
+            leg_m = STRETCHED * self._leg_m[side]
+            reach = np.sqrt(np.maximum(leg_m**2 - aside, 0.0))
+            above = np.maximum(above, np.where(away[:, 1] > 0, away[:, 1] - reach, 0.0))
+        return above
+
     def _reach(self, side: str) -> None:
         """The ankle goes to where ours belongs; the foot keeps its turn."""
         thigh, shank, foot = (self._bones[f"{side}_{b}"] for b in ("thigh", "shank", "foot"))
@@ -221,15 +236,18 @@ class _Moved:
         self.turns[shank] = lower @ self.turns[shank]
 
 
-def _leg_m(place: Mapping[str, np.ndarray], character: Character) -> float:
-    lengths = [
-        np.linalg.norm(place[f"{side}_shank"] - place[f"{side}_thigh"])
-        + np.linalg.norm(place[f"{side}_foot"] - place[f"{side}_shank"])
+def _legs_m(place: Mapping[str, np.ndarray], character: Character) -> dict[str, float]:
+    """Thigh and shank together, by side."""
+    lengths = {
+        side: float(
+            np.linalg.norm(place[f"{side}_shank"] - place[f"{side}_thigh"])
+            + np.linalg.norm(place[f"{side}_foot"] - place[f"{side}_shank"])
+        )
         for side in ("left", "right")
-    ]
-    if min(lengths) < 1e-4:
+    }
+    if min(lengths.values()) < 1e-4:
         raise InputError(f"{character.path}: its legs have no length at rest")
-    return float(np.mean(lengths))
+    return lengths
 
 
 def _spine_followed(spine: Sequence[int]) -> dict[int, tuple[str, str, float]]:
