@@ -243,11 +243,35 @@ def _first_pass(
     except KeyboardInterrupt:
         interrupted = True
     return _Tracked(
-        updates=[_named(some, names) for some in updates],
+        updates=_without_tails([_named(some, names) for some in updates], instants),
         shapes={name: pipeline.estimator(name).shape for name in set(names.values())},
         interrupted=interrupted,
         notes=tuple(notes),
     )
+
+
+def _without_tails(updates: list[list[TrackUpdate]], instants: Instants) -> list[list[TrackUpdate]]:
+    """Nobody is followed after the last instant in which a camera or a sensor told of them.
+
+    Between two such instants motion bridges a gap; after the last nothing says where they are.
+    """
+    kept: list[list[TrackUpdate]] = []
+    going_on: set[str] = set()
+    for instant in range(len(updates) - 1, -1, -1):
+        readings = instants.readings(instant)
+        measured = {
+            update.name
+            for update in updates[instant]
+            if (update.person >= 0).any() or _tells(readings.get(update.name))
+        }
+        here = {update.name for update in updates[instant]}
+        going_on = (going_on & here) | measured
+        kept.append([update for update in updates[instant] if update.name in going_on])
+    return kept[::-1]
+
+
+def _tells(reading: ImuReading | None) -> bool:
+    return reading is not None and bool(np.isfinite(reading.bone_rotation_in_world).any())
 
 
 def _named(updates: tuple[TrackUpdate, ...], names: Mapping[int, str]) -> list[TrackUpdate]:
