@@ -53,7 +53,7 @@ def record(benchmark, update, detections, skip: int) -> None:
     print(f"\n{benchmark.name}: {benchmark.extra_info}")
 
 
-@pytest.mark.parametrize(("cameras", "count"), [(8, 6), (4, 2), (4, 6), (8, 2)])
+@pytest.mark.parametrize(("cameras", "count"), [(8, 12), (8, 6), (4, 2), (4, 6), (8, 2)])
 def test_tracker_in_steady_state(benchmark, cameras, count):
     """Everyone is tracked; 5 % of detections missing, a spurious one in every tenth view."""
     rig = ring_of_cameras(cameras)
