@@ -1,13 +1,20 @@
 """What is said about inputs that contradict themselves, by doctor and by solve alike."""
 
 import json
+import re
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from fusecap.body.landmarks import landmark_set_named
+from fusecap.body.pose import forward_kinematics, landmarks_in_world
+from fusecap.body.shape import BodyShape
+from fusecap.body.skeleton import PAPER21
+from fusecap.cli import app
 from fusecap.doctor import diagnose
 from fusecap.errors import CalibrationError, SessionError
+from fusecap.solve.body_measure import BodyMeasure
 from fusecap.sources.calibration_files import load_rig
 from fusecap.sources.session_data import open_session
 from fusecap.sources.session_file import load_session
@@ -166,3 +173,26 @@ def test_cameras_that_are_not_used_are_not_judged(tmp_path):
     assert load_rig(path, names=["cam0", "cam1"]).names == ("cam0", "cam1")
     with pytest.raises(CalibrationError, match=r"no camera 'left'.*cam0, cam1"):
         load_rig(path, names=["left"])
+
+
+def test_a_calibration_of_lenses_alone_is_refused_before_anything_is_detected(tmp_path):
+    path = write_session(tmp_path, frames=3)
+    lenses = re.sub(r"(rotation|translation) = .*", r"\1 = [0, 0, 0]", calibration_toml(ring()))
+    (tmp_path / "calibration.toml").write_text(lenses)
+    assert any("lenses only" in text for text in said(path))
+    with pytest.raises(SessionError, match=r"lenses only.*\n.*--anyway"):
+        CliRunner().invoke(app, ["solve", str(path)], catch_exceptions=False)
+
+
+@pytest.mark.parametrize("height_m", [0.6, 0.8, 1.2, 1.75, 2.3])
+def test_people_from_small_children_to_giants_are_measured(height_m):
+    measure = BodyMeasure(PAPER21, BODY25)
+    shape = BodyShape.from_height(PAPER21, height_m)
+    position, rotation = forward_kinematics(shape, np.zeros((1, PAPER21.pose_size)))
+    points = landmarks_in_world(position, rotation, BODY25.bones(PAPER21), BODY25.offsets_m(shape))[
+        0
+    ]
+    for _ in range(10):
+        measure.add(points)
+    assert measure.shape().height_m == pytest.approx(height_m, rel=0.01)
+    assert np.allclose(measure.shape().offsets_m, shape.offsets_m, atol=0.02 * height_m)

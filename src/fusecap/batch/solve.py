@@ -23,6 +23,7 @@ from fusecap.body.shape import BodyShape
 from fusecap.checks import check_measurements
 from fusecap.errors import SessionError
 from fusecap.files import plain
+from fusecap.findings import Finding
 from fusecap.pipeline import Pipeline, make_estimator, observation_of
 from fusecap.progress import Progress
 from fusecap.setup import Setup, setup_of
@@ -30,6 +31,7 @@ from fusecap.solve.estimator import Estimator
 from fusecap.solve.reprojection import Reprojection
 from fusecap.solve.whole_motion import AHEAD, PIECE, Settled, WholeMotion
 from fusecap.solve.window_solver import Workspace
+from fusecap.sources.session import Session
 from fusecap.sources.session_data import SessionData
 from fusecap.take import Take, TakeBuilder, provenance
 from fusecap.types import (
@@ -122,10 +124,8 @@ def solve_session(
     Raises `SessionError` for what is an error to doctor, unless `anyway`.
     """
     found = check_measurements(data.session, data.rig, data.keypoints, data.samples, data.times_s)
-    errors = [finding for finding in found if finding.severity == "error"]
-    if errors and not anyway:
-        listed = "\n".join(f"{data.session.path}: {finding}" for finding in errors)
-        raise SessionError(f"{listed}\nto solve it all the same: fusecap solve --anyway")
+    if not anyway:
+        refuse_errors(data.session, [*data.findings, *found])
     odd = [finding for finding in found.sorted() if finding.severity != "info"]
     return solve_instants(
         setup_of(data.session, data.rig, data.landmarks),
@@ -134,6 +134,14 @@ def solve_session(
         session_sha256=data.content_hash,
         notes=tuple(str(finding) for finding in (*data.findings, *odd)),
     )
+
+
+def refuse_errors(session: Session, findings: Sequence[Finding]) -> None:
+    """Raises `SessionError` with what is an error, if anything is."""
+    errors = [finding for finding in findings if finding.severity == "error"]
+    if errors:
+        listed = "\n".join(f"{session.path}: {finding}" for finding in errors)
+        raise SessionError(f"{listed}\nto solve it all the same: fusecap solve --anyway")
 
 
 def solve_instants(

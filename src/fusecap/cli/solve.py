@@ -71,11 +71,12 @@ def solve(
     A recording is solved from all that was recorded, in two passes; with --as-live its events are
     gone through as in the run, and the poses are compared with those recorded.
     """
-    from fusecap.batch.solve import solve_session
+    from fusecap.batch.solve import refuse_errors, solve_session
     from fusecap.cli.detect import detect_missing, print_detection
     from fusecap.exports.take_format import ExportOptions
     from fusecap.files import safe_name
     from fusecap.recording.layout import SUFFIX
+    from fusecap.sources.session_cameras import open_rig
     from fusecap.sources.session_data import open_session
     from fusecap.sources.session_file import load_session
 
@@ -87,6 +88,8 @@ def solve(
         raise InputError(f"--as-live: {session} is no recording (.mcap) of a live run")
     loaded = load_session(session)
     target = _take_path(out, loaded.folder / f"{safe_name(loaded.settings.name)}.npz")
+    if not anyway:  # before hours of detection
+        refuse_errors(loaded, open_rig(loaded)[1])
     detected = detect_missing(loaded, quiet=as_json)
     if detected is not None and not as_json:
         print_detection(detected)

@@ -43,6 +43,6 @@ def _check_networks(options: DetectorOptions, findings: Findings) -> None:
                     f"the network '{model}' is not on this machine yet",
                     f"fusecap detect downloads it once, from {stored.url}",
                 )
-            runtime_for("x.onnx" if stored else model_path(model), options.runtime)
+            runtime_for(f"{model}.onnx" if stored else model_path(model), options.runtime)
         except FusecapError as error:
             findings.add("error", "detector", str(error))

@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.body.pose import forward_kinematics, landmarks_in_world
-from fusecap.body.shape import MAX_HEIGHT_M, MIN_HEIGHT_M, BodyShape
+from fusecap.body.shape import MAX_HEIGHT_M, MIN_HEIGHT_M, REFERENCE_HEIGHT_M, BodyShape
 from fusecap.body.skeleton import Skeleton
 
 _SEGMENTS: dict[str, tuple[tuple[str, str], ...]] = {
@@ -29,8 +29,9 @@ _SEGMENTS: dict[str, tuple[tuple[str, str], ...]] = {
 }
 _STATURE = ("upper_arm", "forearm", "thigh", "shank", "trunk")
 _END_BONE = {"upper_arm": "forearm", "forearm": "hand", "thigh": "shank", "shank": "foot"}
-_PLAUSIBLE = (0.6, 1.5)
-"""A sample outside these multiples of the reference person's length is a triangulation error."""
+_PLAUSIBLE = (0.8 * MIN_HEIGHT_M / REFERENCE_HEIGHT_M, 1.1 * MAX_HEIGHT_M / REFERENCE_HEIGHT_M)
+"""A sample outside these multiples of the reference person's length is a triangulation error: it is
+of nobody between the least and the greatest stature, with what limbs vary at one."""
 MEASURE_SHARE = 25
 """Between two measurements as many instants as there were so far, over this."""
 _SPINE = ("spine", "spine1", "spine2", "spine3", "neck")
@@ -133,7 +134,7 @@ class BodyMeasure:
             position, _ = forward_kinematics(rest, np.zeros((1, self.skeleton.pose_size)))
             side = position[0, bone("left_upper_arm")] - position[0, bone("left_thigh")]
             # The diagonal hip-shoulder keeps its sideways part; the spine takes up the rest.
-            wanted = np.sqrt(max(lengths["trunk"] ** 2 - side[0] ** 2, 0.04))
+            wanted = np.sqrt(max(lengths["trunk"] ** 2 - side[0] ** 2, (0.5 * side[1]) ** 2))
             offsets[spine, 1] += (wanted - side[1]) / len(spine)
         return BodyShape(skeleton=self.skeleton, offsets_m=offsets, height_m=shape.height_m)
 

@@ -27,6 +27,15 @@ def check_rig(rig: Rig, *, floor: bool = True) -> list[Finding]:
     findings = []
     centres = {camera.name: camera.position_in_world for camera in rig.cameras}
     names = list(centres)
+    if len(rig) > 1 and camera_spread(rig) < SAME_PLACE_M:
+        return [
+            Finding(
+                severity="error",
+                where="calibration",
+                found="all cameras stand at the same place: it holds their lenses only",
+                remedy="fusecap calibrate extrinsics places them; name what it wrote",
+            )
+        ]
     for i, first in enumerate(names):
         for second in names[i + 1 :]:
             if np.linalg.norm(centres[first] - centres[second]) < SAME_PLACE_M:

@@ -1,0 +1,130 @@
+"""docs/faults.md from the checks themselves: `uv run python tests/faults_page.py` writes it.
+
+A row per finding and per refusal in the rooms that read and check inputs, as their source words
+it, and the tests that ask for a stretch of those words.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGE = ROOT / "docs" / "faults.md"
+ROOMS = ("checks", "doctor", "sources")
+HEAD = """# Faults
+
+What `fusecap doctor` and `fusecap solve` say of inputs, made from their source by
+`uv run python tests/faults_page.py`. A warning is a note of a solve; an error refuses it unless
+`--anyway`, and a refusal ends any command. The last column names a test that builds the fault.
+
+| | where | message | remedy | test |
+|---|---|---|---|---|
+"""
+_ERRORS = ("InputError", "SessionError", "CalibrationError")
+_LEAST_WORDS = 9
+"""Characters of a message that a test must ask for."""
+
+
+def page() -> str:
+    """The text of the page."""
+    tests = _asked_for()
+    rows = {row: None for room in ROOMS for row in _rows(ROOT / "src/fusecap" / room)}
+    return HEAD + "".join(_line(row, tests) for row in rows)
+
+
+Row = tuple[str, str, str, str]
+"""Severity, where, message, remedy."""
+
+
+def _line(row: Row, tests: list[tuple[str, str]]) -> str:
+    cells = [cell.replace("|", "\\|").replace("\n", " ") for cell in row]
+    test = _test_of(row, tests)
+    return f"| {' | '.join([*cells, f'`{test}`' if test else ''])} |\n"
+
+
+def _test_of(row: Row, tests: list[tuple[str, str]]) -> str:
+    """The test that asks for the longest stretch of the row's words."""
+    words = re.sub(r"\d+", "…", " ".join(row[1:]).lower())
+    parts = [part.strip() for part in " ".join(row[2:]).lower().split("…")]
+    parts = [part for part in parts if len(part) >= _LEAST_WORDS and " " in part]
+    longest = (0, "")
+    for text, name in tests:
+        shared = (
+            len(text) if text in words else max((len(p) for p in parts if p in text), default=0)
+        )
+        longest = max(longest, (shared, name))
+    return longest[1] if longest[0] else ""
+
+
+def _rows(folder: Path) -> Iterator[Row]:
+    for file in sorted(folder.rglob("*.py")):
+        calls = [n for n in ast.walk(ast.parse(file.read_text())) if isinstance(n, ast.Call)]
+        for call in sorted(calls, key=lambda call: call.lineno):
+            row = _finding(call) or _refusal(call, file)
+            if row is not None and re.search(r"[a-z]{3}", row[2]):
+                yield row
+
+
+def _finding(call: ast.Call) -> Row | None:
+    named = {key.arg: key.value for key in call.keywords}
+    if isinstance(call.func, ast.Name) and call.func.id == "Finding":
+        values = [named.get(key) for key in ("severity", "where", "found", "remedy")]
+    elif ast.unparse(call.func) == "findings.add" and len(call.args) >= 3:
+        values = [*call.args, None][:4]
+    else:
+        return None
+    severity, where, found, remedy = (_text(value) for value in values)
+    return (
+        (severity if severity in ("error", "warning", "info") else "warning"),
+        where,
+        found,
+        remedy,
+    )
+
+
+def _refusal(call: ast.Call, file: Path) -> Row | None:
+    if not (isinstance(call.func, ast.Name) and call.func.id in _ERRORS and call.args):
+        return None
+    where, _, message = _text(call.args[0]).partition(": ")
+    if not message:
+        where, message = file.stem.replace("_", " "), where
+    found, _, remedy = message.partition("; ")
+    return "refused", where, found, remedy
+
+
+def _text(node: ast.expr | None) -> str:
+    """Of a string in the source, with … for what is put in."""
+    match node:
+        case ast.Constant(value=str(text)):
+            return text
+        case ast.JoinedStr(values=values):
+            return "".join(_text(value) for value in values)
+        case ast.BinOp(left=left, op=ast.Add(), right=right):
+            return _text(left) + _text(right)
+        case None:
+            return ""
+        case _:
+            return "…"
+
+
+def _asked_for() -> list[tuple[str, str]]:
+    """What tests look for in messages, and their names."""
+    found = []
+    for file in sorted((ROOT / "tests").glob("test_*.py")):
+        for test in ast.walk(ast.parse(file.read_text())):
+            if not (isinstance(test, ast.FunctionDef) and test.name.startswith("test_")):
+                continue
+            for node in ast.walk(test):
+                if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                    plain = re.sub(r"[-+]?\d+(\.\d+)?%?", "…", node.value.lower())
+                    text = max(re.split(r"\.\*|\\", plain), key=len).strip()
+                    if len(text) >= _LEAST_WORDS and " " in text:
+                        found.append((text, f"{file.stem}.{test.name}"))
+    return found
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page())
