@@ -235,6 +235,8 @@ def _opened(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
         if not pictures:
             kinds = ", ".join(sorted({s.type for s in container.streams})) or "nothing"
             raise InputError(f"{path}: no video in this file, found {kinds}; expected a video")
+        if pictures[0].codec_context is None:
+            raise InputError(f"{path}: a video that nothing here can decode; convert the file")
         yield container, pictures[0]
 
 

@@ -21,6 +21,8 @@ from fusecap.sources.synchronizer import people_at
 
 MIN_CONFIDENCE = 0.3
 MIN_SHARED_KEYPOINTS = 6
+NEIGHBOURS = 4
+"""On either side of a camera in a ring of many: pairs then grow with cameras, not their square."""
 
 
 def without_distortion(
@@ -78,15 +80,26 @@ def _rays(camera: Camera, people: np.ndarray) -> np.ndarray:
 
 
 def disagreement_px(rig: Rig, tracks: Sequence[KeypointTrack], times_s: np.ndarray) -> np.ndarray:
-    """(C, C) median disagreement of every pair of cameras; NaN where nobody is seen by both."""
+    """(C, C) median disagreement of pairs of cameras; NaN where nobody is seen by both.
+
+    Of more than nine cameras each is compared with eight.
+    """
     views = [[people_at(track, t) for t in times_s] for track in tracks]
     result = np.full((len(tracks), len(tracks)), np.nan)
-    for i in range(len(tracks)):
-        for j in range(i + 1, len(tracks)):
-            result[i, j] = result[j, i] = _median_px(
-                rig.cameras[i], rig.cameras[j], views[i], views[j]
-            )
+    for i, j in _pairs(len(tracks)):
+        result[i, j] = result[j, i] = _median_px(rig.cameras[i], rig.cameras[j], views[i], views[j])
     return result
+
+
+def _pairs(cameras: int) -> list[tuple[int, int]]:
+    """Those that are compared, in order: all, or every camera with the four after it in a ring."""
+    near = {(i, (i + step) % cameras) for i in range(cameras) for step in range(1, NEIGHBOURS + 1)}
+    return sorted({(min(i, j), max(i, j)) for i, j in near if i != j})
+
+
+def _partners(camera: int, cameras: int) -> list[int]:
+    """Those that one of so many cameras is compared with."""
+    return [i + j - camera for i, j in _pairs(cameras) if camera in (i, j)]
 
 
 def _median_px(
@@ -118,7 +131,7 @@ def best_shift_s(
     shifts_s: np.ndarray,
 ) -> tuple[float, float]:
     """The delay to add to one camera's clock that makes it agree best, and what is left [px]."""
-    others = [other for other in range(len(tracks)) if other != camera]
+    others = _partners(camera, len(tracks))
     views = {other: [people_at(tracks[other], t) for t in times_s] for other in others}
     left = np.full(len(shifts_s), np.inf)
     for index, shift_s in enumerate(shifts_s):
@@ -140,8 +153,7 @@ def camera_disagreement_px(
     known = np.sort(
         [
             _median_px(rig.cameras[camera], rig.cameras[other], views[camera], views[other])
-            for other in range(len(tracks))
-            if other != camera
+            for other in _partners(camera, len(tracks))
         ]
     )
     known = known[np.isfinite(known)]
@@ -152,13 +164,13 @@ def people_in_world(rig: Rig, tracks: Sequence[KeypointTrack], times_s: np.ndarr
     """(n, K, 3) landmarks [m] of people whom pairs of views agree about; NaN where not seen."""
     found = [np.empty((0, len(tracks[0].landmarks.landmark_names), 3))]
     views = [[people_at(track, t) for t in times_s] for track in tracks]
-    for i, first in enumerate(rig.cameras):
-        for j, second in enumerate(rig.cameras[i + 1 :], start=i + 1):
-            for a, b in zip(views[i], views[j], strict=True):
-                rows, columns, cost = pair_distances_px(first, second, a, b)
-                good = cost < 0.01 * np.hypot(*first.size_px)
-                if good.any():
-                    found.append(_triangulated(first, second, a[rows[good]], b[columns[good]]))
+    for i, j in _pairs(len(tracks)):
+        first, second = rig.cameras[i], rig.cameras[j]
+        for a, b in zip(views[i], views[j], strict=True):
+            rows, columns, cost = pair_distances_px(first, second, a, b)
+            good = cost < 0.01 * np.hypot(*first.size_px)
+            if good.any():
+                found.append(_triangulated(first, second, a[rows[good]], b[columns[good]]))
     return np.concatenate(found)
 
 
