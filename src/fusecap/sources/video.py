@@ -221,7 +221,7 @@ def _opened(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
     if path.stat().st_size == 0:
         raise InputError(f"{path}: an empty file, expected a video; record or copy it again")
     try:
-        container = av.open(str(path))
+        container = av.open(str(path), metadata_errors="replace")
     except (FFmpegError, OSError) as error:
         reason = error.strerror or str(error)
         raise InputError(

@@ -33,7 +33,7 @@ from jaxtyping import Float, Int
 
 from fusecap.body.landmarks import LANDMARKS, landmark_set_named
 from fusecap.errors import InputError
-from fusecap.evaluate.datasets.files import camera_at_centre, text_of, unpacked
+from fusecap.evaluate.datasets.files import camera_at_centre, floats, text_of, unpacked
 from fusecap.evaluate.datasets.recording import DatasetSequence, last_frame, read_views
 from fusecap.evaluate.metrics import correct_limbs, identity_switches, match_people
 from fusecap.evaluate.tables import Table
@@ -184,7 +184,7 @@ def load_truth(path: Path | str) -> ShelfTruth:
     path = Path(path)
     words = text_of(path, "Shelf truth").split()
     try:
-        values = iter([float(word) for word in words])
+        values = iter(floats(words, str(path)).tolist())
         joints, frames = int(next(values)), int(next(values))
         if joints != 15:
             raise InputError(f"{path}: {joints} joints, expected Shelf's 15")
@@ -195,7 +195,7 @@ def load_truth(path: Path | str) -> ShelfTruth:
                 actor = int(next(values))
                 rows = np.array([next(values) for _ in range(4 * joints)]).reshape(4, joints)
                 people[-1][actor] = np.where(rows[3, :, None] > 0, rows[:3].T, np.nan)
-    except (StopIteration, ValueError) as error:
+    except (StopIteration, ValueError, OverflowError) as error:
         raise InputError(f"{path} is not Shelf truth, or is cut short") from error
     count = 1 + max((actor for frame in people for actor in frame), default=-1)
     points = np.full((count, frames, joints, 3), np.nan)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from fusecap.errors import InputError
 from fusecap.sources.imu_files.loader import ImuFormat
 from fusecap.sources.imu_files.table import read_table
 from fusecap.sources.imu_files.track import ImuTrack, since_first, tidy
@@ -18,7 +19,9 @@ _SECONDS = {"time_s": 1.0, "time_ms": 1e-3, "time_us": 1e-6, "time_ns": 1e-9}
 def read(path: Path, _sensor: str | None, _rate_hz: float | None) -> ImuTrack:
     """The samples; raises `InputError`."""
     table = read_table(path, *_SECONDS)
-    unit = next(column for column in table.columns if column in _SECONDS)
+    unit = next((column for column in table.columns if column in _SECONDS), None)
+    if unit is None:
+        raise InputError(f"{path}: no column {' or '.join(_SECONDS)}, found {table.columns[:1]}")
     times_s, clock = since_first(table.take([unit])[:, 0] * _SECONDS[unit])
     accelerations, notes = table.accelerations(["ax", "ay", "az"])
     return tidy(

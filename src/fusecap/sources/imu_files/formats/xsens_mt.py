@@ -31,7 +31,7 @@ PACKET_MODULUS = 65536
 _QUATERNION = [f"Quat_q{i}" for i in range(4)]
 _MATRIX = [f"Mat[{row}][{column}]" for row in (1, 2, 3) for column in (1, 2, 3)]
 _EULER_XYZ = ["Roll", "Pitch", "Yaw"]
-_RATE = re.compile(r"Update Rate:\s*([\d.]+)", re.IGNORECASE)
+_RATE = re.compile(r"Update Rate:\s*(\d+(?:\.\d+)?)", re.IGNORECASE)
 
 
 def read(path: Path, _sensor: str | None, rate_hz: float | None) -> ImuTrack:
