@@ -2,6 +2,7 @@
 
 import copy
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -262,3 +263,17 @@ def test_the_command_shows_the_bones_it_matched(tmp_path):
     assert told["bones"]["left_shank"] == "mixamorig:LeftLeg"
     assert [Path(file).name for file in told["files"]] == ["t_avatar.glb"]
     assert "mixamorig:LeftLeg" in CliRunner().invoke(app, command).output
+
+
+@pytest.mark.slow
+def test_an_fbx_character_goes_in_and_out_through_blender(tmp_path, monkeypatch):
+    python = os.environ.get("FUSECAP_BPY_PYTHON")
+    if not python:
+        pytest.skip("FUSECAP_BPY_PYTHON does not name a Python with bpy")
+    monkeypatch.setenv("FUSECAP_BLENDER", python)
+    take = two_walkers(10)
+    avatar, out = tmp_path / "avatar.fbx", tmp_path / "out.fbx"
+    fusecap.export(take.of_subjects([1]), avatar, rig="mixamo")
+    done = fusecap.retarget(take, avatar, out, subject="anna")
+    assert done.bones["left_shank"] == "mixamorig:LeftLeg"
+    assert done.scale == pytest.approx(1.9 / 1.5, abs=1e-3) and out.stat().st_size > 10_000
