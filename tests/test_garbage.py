@@ -13,11 +13,19 @@ import pytest
 
 import fusecap
 from fusecap.associate.options import TrackerOptions
-from fusecap.believable import MOST_DETECTIONS, MOST_PEOPLE, believable_reading, surest
+from fusecap.believable import (
+    MOST_DETECTIONS,
+    MOST_PEOPLE,
+    believable_detections,
+    believable_reading,
+    surest,
+    surest_of_views,
+)
 from fusecap.body.landmarks import landmark_set_named
 from fusecap.body.prior import load_prior
 from fusecap.body.shape import BodyShape
 from fusecap.body.skeleton import PAPER21, Skeleton
+from fusecap.engine.cameras import Cameras
 from fusecap.errors import FusecapError, InputError
 from fusecap.evaluate.demo_scene import demo_scene
 from fusecap.geometry.camera import Camera
@@ -25,7 +33,7 @@ from fusecap.solve.estimator import SubjectModel
 from fusecap.solve.options import SolverOptions, Weights
 from fusecap.solve.pose_solver import ImuSites
 from fusecap.sources.keypoint_files import read_people
-from fusecap.types import Detections, ImuReading
+from fusecap.types import CameraSample, Detections, ImuReading
 
 
 @pytest.fixture(scope="module")
@@ -112,6 +120,27 @@ def test_more_people_than_can_be_paired_are_refused(scene):
     people = (np.repeat(scene.detections[0].people[0][:1], 64, axis=0),) * 17
     with pytest.raises(InputError, match=f"at most {MOST_DETECTIONS}"):
         tracker.update(Detections(timestamp_ns=1, people=people), {}, 1)
+
+
+def test_a_crowd_in_many_views_is_thinned_to_the_surest(scene):
+    """31 cameras that see 40 people each: more than a sorter takes."""
+    one = scene.detections[0].people[0][0]
+    people = [np.repeat(one[None], 40, axis=0) for _ in range(31)]
+    for view in people:
+        view[:, :, 2] = np.linspace(0.2, 0.9, 40)[:, None]
+    cameras = Cameras((60.0,) * 31, len(one))
+    for camera, view in enumerate(people):
+        cameras.take(CameraSample(timestamp_ns=0, camera=camera, people=view))
+    found = cameras.detections(0)
+    assert sum(map(len, found.people)) == MOST_DETECTIONS
+    assert min(view[:, 0, 2].min() for view in found.people) > 0.29
+    rig = fusecap.Rig(cameras=tuple(replace(scene.rig.cameras[0], name=str(n)) for n in range(31)))
+    checked = believable_detections(found, len(rig), len(one))
+    assert believable_detections(checked, len(rig), len(one)) is checked
+    few = surest_of_views(people[:3])
+    assert all(a is b for a, b in zip(few, people[:3], strict=True))
+    crowd = surest_of_views([np.repeat(one[None], 2000, axis=0)])
+    assert len(crowd[0]) == MOST_PEOPLE
 
 
 ODD = (np.nan, np.inf, -np.inf, -1.0, 1e300, -1e160)

@@ -29,6 +29,7 @@ from typing import Any, TypeVar
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from fusecap.believable import surest_of_views
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.detect.detector import Detector, DetectorOptions
 from fusecap.errors import InputError, SessionError
@@ -314,7 +315,8 @@ class ExpectedPeople:
             elif now_ns - self._seen_ns[index] > self._hold_ns[index]:
                 self._people[index] = self._nobody
         if self._pipeline is not None:
-            self._pipeline.step(Detections(timestamp_ns=now_ns, people=tuple(self._people)), {})
+            people = surest_of_views(self._people)
+            self._pipeline.step(Detections(timestamp_ns=now_ns, people=people), {})
 
 
 class _Work:

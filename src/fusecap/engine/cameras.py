@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from fusecap.believable import believable_keypoints
+from fusecap.believable import believable_keypoints, surest_of_views
 from fusecap.engine.samples import Samples
 from fusecap.sources.synchronizer import EXACT_S, Frame, people_amid
 from fusecap.types import CameraSample, Detections
@@ -51,7 +51,7 @@ class Cameras:
             )
             people.append(self._nobody if found is None else found)
             looked.append(self.looks(camera, now_ns))
-        return Detections(timestamp_ns=now_ns, people=tuple(people), looked=tuple(looked))
+        return Detections(timestamp_ns=now_ns, people=surest_of_views(people), looked=tuple(looked))
 
     def looks(self, camera: int, now_ns: int) -> bool:
         """Whether the camera delivered shortly before an instant, or at it."""

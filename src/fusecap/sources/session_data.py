@@ -16,6 +16,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from fusecap.believable import surest_of_views
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.errors import FusecapError, SessionError
 from fusecap.findings import Finding
@@ -110,7 +111,7 @@ class SessionData:
         t_s = float(self.times_s[instant])
         return Detections(
             timestamp_ns=round(t_s * 1e9),
-            people=tuple(people_at(track, t_s) for track in self.keypoints),
+            people=surest_of_views([people_at(track, t_s) for track in self.keypoints]),
         )
 
     def frames(self) -> Iterator[tuple[int, Detections, dict[str, ImuReading]]]:
