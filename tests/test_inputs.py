@@ -128,6 +128,14 @@ def test_no_reader_takes_more_bytes_than_its_kind_may_have(name, tmp_path):
         READERS[name](path)
 
 
+def test_an_hour_of_frame_times_is_read(tmp_path):
+    path = tmp_path / "timestamps.csv"
+    row = "".join(f"{camera},1760000000.123456789\n" for camera in range(4))
+    path.write_text("cam_id,frame_time\n" + row * 190_000)
+    assert path.stat().st_size > 16e6
+    assert inputs.read_text(path, inputs.FRAME_TIMES)
+
+
 def test_a_file_that_states_no_size_is_read_as_far_as_its_kind_goes(monkeypatch):
     """As those below /proc do."""
     small = inputs.InputKind(what="a few bytes", most_bytes=10)

@@ -68,6 +68,7 @@ KEYPOINTS = InputKind(what="keypoints of one frame as JSON", most_bytes=4_000_00
 DETECTION = InputKind(what="the record of a detection", most_bytes=64 * _MB)
 SENSORS = InputKind(what="samples of sensors", most_bytes=1024 * _MB)
 POINTS = InputKind(what="a table of points as CSV", most_bytes=16 * _MB)
+FRAME_TIMES = InputKind(what="times of frames as CSV", most_bytes=512 * _MB)
 PICTURE = InputKind(what="a picture", most_bytes=256 * _MB)
 VIDEO = InputKind(what="a video", most_bytes=None)
 RECORDING = InputKind(what="a recording (.mcap)", most_bytes=None)
@@ -82,8 +83,21 @@ ARCHIVE = InputKind(what="a tar archive", most_bytes=None)
 CELL = InputKind(what="a cell of an experiment", most_bytes=64 * _MB)
 
 KINDS = (
-    *(SESSION, SETTINGS, CALIBRATION, BOARD, KEYPOINTS, DETECTION, SENSORS, POINTS, PICTURE),
-    *(VIDEO, RECORDING, TAKE, PRIOR, MOTION, CHARACTER, NETWORK, DATASET, ARCHIVE, CELL),
+    *(SESSION, SETTINGS, CALIBRATION, BOARD, KEYPOINTS, DETECTION, SENSORS, POINTS),
+    *(
+        FRAME_TIMES,
+        PICTURE,
+        VIDEO,
+        RECORDING,
+        TAKE,
+        PRIOR,
+        MOTION,
+        CHARACTER,
+        NETWORK,
+        DATASET,
+        ARCHIVE,
+        CELL,
+    ),
 )
 
 

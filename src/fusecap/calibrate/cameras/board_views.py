@@ -26,7 +26,7 @@ from fusecap.calibrate.cameras.board import (
     why_not_found,
 )
 from fusecap.errors import CalibrationError, nearest
-from fusecap.inputs import PICTURE, POINTS, read_bytes, read_text
+from fusecap.inputs import FRAME_TIMES, PICTURE, read_bytes, read_text
 from fusecap.progress import Progress
 from fusecap.sources.video import VIDEO_SUFFIXES, Video
 
@@ -142,7 +142,7 @@ def read_timestamps(path: Path | str) -> dict[str, list[int]]:
     """Per `cam_id` the `sync_index` of each of its frames, in order."""
     path = Path(path)
     try:
-        rows = list(csv.DictReader(io.StringIO(read_text(path, POINTS), newline="")))
+        rows = list(csv.DictReader(io.StringIO(read_text(path, FRAME_TIMES), newline="")))
     except csv.Error as error:
         raise CalibrationError(f"{path}: cannot be read: {error}") from None
     result: dict[str, list[tuple[float, int]]] = {}
