@@ -9,6 +9,7 @@ import pytest
 
 from fusecap.associate.sensor_vote import FITS, SensorVote
 from fusecap.associate.track import Track
+from fusecap.batch.solve import solve_instants
 from fusecap.body.landmarks import landmark_set_named
 from fusecap.evaluate.imu_noise import IMUS_6
 from fusecap.evaluate.simulated_solve import setup_of_simulation
@@ -75,6 +76,39 @@ def test_people_who_exchange_their_sensors_exchange_their_names_with_a_note(simu
     assert set(range(120 + RATE_HZ, 240)) <= exchanged, "within a second anna is ben"
     assert not exchanged & set(range(120))
     assert len(notes) == 2 and all("sensors say so" in note for note in notes)
+
+
+class LateSensors:
+    """A simulation whose sensors speak from an instant on, as recorded measurements."""
+
+    def __init__(self, simulation: Simulation, first: int) -> None:
+        self._simulation, self._first = simulation, first
+
+    def __len__(self) -> int:
+        return 200
+
+    def detections(self, instant):
+        return self._simulation.detections[instant]
+
+    def readings(self, instant):
+        if instant < self._first:
+            return {}
+        return {name: rows[instant] for name, rows in self._simulation.imu_readings.items()}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backwards", [False, True])
+def test_a_take_is_right_from_the_start_though_sensors_told_late(simulation, backwards):
+    setup = setup_of_simulation(simulation, options=SolverOptions(window=1))
+    subjects = [replace(model, start_m=None) for model in setup.subjects]
+    setup = replace(setup, subjects=tuple(subjects[::-1] if backwards else subjects))
+    solved = solve_instants(setup, LateSensors(simulation, 120))
+    take, truth = solved.take, simulation.truth
+    for row, name in enumerate(take.subject_names):
+        true_m = truth.bone_position_in_world_m[truth.subject_names.index(name), :200, 0]
+        away_m = np.linalg.norm(take.bone_position_in_world_m[row, :, 0] - true_m, axis=1)
+        assert take.tracked[row].mean() > 0.95
+        assert np.nanmax(away_m) < 0.3
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -74,6 +74,9 @@ class Step:
 
     updates: tuple[TrackUpdate, ...]
     estimates: tuple[Estimate, ...]
+    paired_anew: Mapping[str, str] = field(default_factory=dict)
+    """Who turned out to be somebody else, by name, and under which name they were followed before;
+    empty: they were a bystander."""
     notes: tuple[str, ...] = ()
     """What a user should know, in words."""
 
@@ -90,17 +93,23 @@ def observation_of(
     return Observation(timestamp_ns=detections.timestamp_ns, keypoints=keypoints, imu=imu)
 
 
+def worn_sensors(setup: Setup) -> dict[str, tuple[str, ...]]:
+    """Per subject that wears any, the bones of its sensors, in the order of its readings."""
+    bones = setup.skeleton.bone_names
+    return {
+        model.name: tuple(bones[bone] for bone in model.sites.bone)
+        for model in setup.subjects
+        if model.sites.bone
+    }
+
+
 def _own_sorter(setup: Setup) -> Sorter | None:
     """As the setup asks for it; None without cameras."""
     if not len(setup.rig):
         return None
-    bones = setup.skeleton.bone_names
+    sensors = worn_sensors(setup)
     named = [
-        Subject(
-            name=model.name,
-            start_m=model.start_m,
-            sensors=tuple(bones[bone] for bone in model.sites.bone),
-        )
+        Subject(name=model.name, start_m=model.start_m, sensors=sensors.get(model.name, ()))
         for model in setup.subjects
     ]
     if setup.associate == "paper":
@@ -183,6 +192,7 @@ class Pipeline:
         self._step = Step(
             updates=tuple(updates),
             estimates=tuple(estimate for estimate in results if estimate is not None),
+            paired_anew=self._sorter.paired_anew if isinstance(self._sorter, Tracker) else {},
             notes=tuple(self._notes),
         )
         return self._step

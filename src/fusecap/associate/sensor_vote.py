@@ -90,26 +90,41 @@ class SensorVote:
         """One instant more; `landmarks` are NaN where not measured now."""
         self._mean = {track: self._mean.get(track, {}) for track in tracks}
         heard = set()
-        for name, rows in self._rows.items():
+        for name in self._rows:
             if name not in readings:
                 continue
-            turned = readings[name].bone_rotation_in_world[rows[:, 0]]
-            expected = np.einsum("lij,lj->li", turned, self._rest[name])
-            if np.isfinite(expected[:, 0]).sum() < _MIN_LIMBS:
+            away = self.away(landmarks, name, readings[name])
+            if away is None:
                 continue
             heard.add(name)
-            limb = landmarks[:, rows[:, 2]] - landmarks[:, rows[:, 1]]
-            length = np.linalg.norm(limb, axis=2)
-            off = 1.0 - np.einsum("tli,li->tl", limb, expected) / np.maximum(length, 1e-9)
-            known = np.isfinite(off)
-            count = known.sum(axis=1)
-            away = np.where(known, off, 0.0).sum(axis=1) / np.maximum(count, 1)
-            for t in np.flatnonzero(count >= _MIN_LIMBS).tolist():
+            for t in np.flatnonzero(np.isfinite(away)).tolist():
                 mean, heard_s = self._mean[tracks[t]].get(name, (0.0, 0.0))
                 heard_s += elapsed_s
                 share = min(elapsed_s / min(heard_s, SPAN_S), 1.0) if heard_s > 0.0 else 1.0
                 self._mean[tracks[t]][name] = (mean + share * (float(away[t]) - mean), heard_s)
         self.heard = frozenset(heard)
+
+    def away(
+        self, landmarks: Float[np.ndarray, "t k 3"], name: str, reading: ImuReading
+    ) -> Float[np.ndarray, " t"] | None:
+        """Of each skeleton at one instant how badly it fits, NaN where too little is measured.
+
+        None for somebody who has no vote now.
+        """
+        if name not in self._rows:
+            return None
+        rows = self._rows[name]
+        turned = reading.bone_rotation_in_world[rows[:, 0]]
+        expected = np.einsum("lij,lj->li", turned, self._rest[name])
+        if np.isfinite(expected[:, 0]).sum() < _MIN_LIMBS:
+            return None
+        limb = landmarks[:, rows[:, 2]] - landmarks[:, rows[:, 1]]
+        length = np.linalg.norm(limb, axis=2)
+        off = 1.0 - np.einsum("tli,li->tl", limb, expected) / np.maximum(length, 1e-9)
+        known = np.isfinite(off)
+        count = known.sum(axis=1)
+        mean = np.where(known, off, 0.0).sum(axis=1) / np.maximum(count, 1)
+        return np.where(count >= _MIN_LIMBS, mean, np.nan)
 
     def misfit(self, track: Track, name: str, least_s: float) -> float:
         """Mean d of a track and a wearer; NaN where heard for less."""

@@ -137,24 +137,25 @@ class Cast:
             or (place.track and (now_ns - place.track.seen_ns) * 1e-9 <= o.memory_s)
         ]
 
-    def pair_anew(self, tracks: Sequence[Track], vote: SensorVote) -> list[str]:
+    def pair_anew(self, tracks: Sequence[Track], vote: SensorVote) -> dict[str, str]:
         """Give wearers the tracks that their sensors fit, where these are clearly others.
 
-        Everyone who is tracked may be who wears them. Returns whose track changed; the identity
-        stays with the place, so who is followed under it must be solved anew.
+        Everyone who is tracked may be who wears them. Returns whose track changed, with the name
+        it was followed under before, empty where it was a bystander's. The identity stays with the
+        place, so who is followed under it must be solved anew.
         """
         places = [p for p in self._places if p.live and p.track and p.name in vote.heard]
         if not places:
-            return []
+            return {}
         cost = np.array([[vote.misfit(t, p.name, SURE_S) for t in tracks] for p in places])
         now = [tracks.index(p.track) for p in places if p.track in tracks]
         if len(now) < len(places) or not np.isfinite(cost[range(len(places)), now]).all():
-            return []
+            return {}
         best = dict(cheapest(np.where(cost < FITS, cost, np.inf)))
         moves = {row: column for row, column in best.items() if column != now[row]}
         gain = sum(cost[row, now[row]] - cost[row, column] for row, column in moves.items())
         if not moves or gain < MARGIN * len(moves):
-            return []
+            return {}
         followed = {p.name: p.track for p in self._places if p.live and p.track}
         given = {places[row].name: tracks[column] for row, column in moves.items()}
         freed = [followed[name] for name in given if followed[name] not in given.values()]
@@ -168,7 +169,8 @@ class Cast:
                 place.track.track_id = numbers[place.name]
         for track, number in zip(freed, spare, strict=True):
             track.track_id = number
-        return list(given)
+        named = {id(track): name for name, track in followed.items()}
+        return {name: named.get(id(track), "") for name, track in given.items()}
 
     def admit(self, tracks: Sequence[Track], now_ns: int, vote: SensorVote) -> None:
         """Give established newcomers inside the volume a subject's place while there is one.

@@ -66,8 +66,8 @@ class Tracker:
         self._last_ns: int | None = None
         self._vote = SensorVote(landmark_set, {s.name: s.sensors for s in subjects if s.sensors})
         self._readings: Mapping[str, ImuReading] = {}
-        self.paired_anew: list[str] = []
-        """Whom sensors gave another track at the last instant."""
+        self.paired_anew: dict[str, str] = {}
+        """Whom sensors gave another track at the last instant, and whose it was before."""
 
     def hear(self, readings: Mapping[str, ImuReading]) -> None:
         """What subjects' sensors say at the instant of the next `update`."""

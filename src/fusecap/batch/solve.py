@@ -19,12 +19,13 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from fusecap.associate.sensor_vote import SensorVote
 from fusecap.body.shape import BodyShape
 from fusecap.checks import check_measurements
 from fusecap.errors import SessionError
 from fusecap.files import plain
 from fusecap.findings import Finding
-from fusecap.pipeline import Pipeline, make_estimator, observation_of
+from fusecap.pipeline import Pipeline, make_estimator, observation_of, worn_sensors
 from fusecap.progress import Progress
 from fusecap.setup import Setup, setup_of
 from fusecap.solve.estimator import Estimator
@@ -156,7 +157,8 @@ def solve_instants(
     """Both passes over recorded instants."""
     started = time.perf_counter()
     pipeline = Pipeline(_with_window(setup, 1))
-    tracked = _first_pass(pipeline, instants, setup.rate_hz, progress)
+    vote = SensorVote(setup.landmarks, worn_sensors(setup))
+    tracked = _first_pass(pipeline, instants, vote, setup.rate_hz, progress)
     reprojection = Reprojection(setup.rig, setup.landmarks)
     builder = TakeBuilder(
         skeleton=setup.skeleton,
@@ -232,17 +234,23 @@ def _in_order(named: list[str], found: Collection[str]) -> list[str]:
 
 
 def _first_pass(
-    pipeline: Pipeline, instants: Instants, rate_hz: float, progress: Progress | None
+    pipeline: Pipeline,
+    instants: Instants,
+    vote: SensorVote,
+    rate_hz: float,
+    progress: Progress | None,
 ) -> _Tracked:
     updates: list[tuple[TrackUpdate, ...]] = []
     names: dict[int, str] = {}
     notes: list[str] = []
+    moved: list[tuple[int, Mapping[str, str]]] = []
     interrupted = False
     try:
         for instant in range(len(instants)):
             step = pipeline.step(instants.detections(instant), instants.readings(instant))
             updates.append(step.updates)
             notes += [f"{instant / rate_hz:.2f} s: {note}" for note in step.notes]
+            moved += [(instant, step.paired_anew)] if step.paired_anew else []
             for update in step.updates:
                 if update.state is not TrackState.TENTATIVE:
                     names[update.track_id] = update.name
@@ -250,12 +258,47 @@ def _first_pass(
                 progress("sorting", instant + 1, len(instants))
     except KeyboardInterrupt:
         interrupted = True
+    named = [_named(some, names) for some in updates]
+    for instant, former in moved:
+        rename_before(named, instant, former, instants, vote)
     return _Tracked(
-        updates=_without_tails([_named(some, names) for some in updates], instants),
+        updates=_without_tails(named, instants),
         shapes={name: pipeline.estimator(name).shape for name in set(names.values())},
         interrupted=interrupted,
         notes=tuple(notes),
     )
+
+
+def rename_before(
+    updates: list[list[TrackUpdate]],
+    instant: int,
+    former: Mapping[str, str],
+    instants: Instants,
+    vote: SensorVote,
+) -> None:
+    """Who turned out at an instant to be somebody else was so before: back to when it began.
+
+    That is the instant from which the new names, until then, fit the sensors better by most.
+    Nothing changes where one of them was a bystander, of whom no instant was kept.
+    """
+    if not all(former.values()):
+        return
+    gain = most = 0.0
+    since = instant
+    for row in range(instant - 1, -1, -1):
+        readings = instants.readings(row)
+        points = {update.name: update.landmarks_in_world_m for update in updates[row]}
+        for name, before in former.items():
+            if name in readings and name in points and before in points:
+                both = np.stack([points[name], points[before]])
+                away = vote.away(both, name, readings[name])
+                if away is not None and np.isfinite(away).all():
+                    gain += float(away[0] - away[1])
+        if gain >= most:
+            most, since = gain, row
+    now = {before: name for name, before in former.items()}
+    for row in range(since, instant):
+        updates[row] = [replace(u, name=now.get(u.name, u.name)) for u in updates[row]]
 
 
 def _without_tails(updates: list[list[TrackUpdate]], instants: Instants) -> list[list[TrackUpdate]]:
