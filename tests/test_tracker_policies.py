@@ -32,7 +32,7 @@ class Stage:
     """Shows a tracker, instant by instant, exact detections of whoever is there."""
 
     def __init__(self, tracker: Tracker, rig=RIG) -> None:
-        self._tracker = tracker
+        self.tracker = tracker
         self._rig = rig
         self._frame = 0
 
@@ -65,7 +65,7 @@ class Stage:
         self._frame += 1
         looked = tuple(left in (None, c) for c in range(len(views)))
         detections = Detections(timestamp_ns=now_ns, people=tuple(views), looked=looked)
-        return self._tracker.update(detections, predicted or {}, now_ns)
+        return self.tracker.update(detections, predicted or {}, now_ns)
 
     def hold(self, seconds: float, *bodies: np.ndarray) -> list[TrackUpdate]:
         """The same for a while; what is reported at its end."""
@@ -293,7 +293,12 @@ def test_bystander_measured_beside_a_subject_does_not_take_the_place():
     stage = Stage(Tracker(RIG, BODY25, TrackerOptions(max_subjects=1)))
     known = subjects_of(stage.hold(1.0, SOMEBODY))
     stage.hold(1.0, SOMEBODY, aside(0.7))
-    assert subjects_of(stage.hold(5.0, aside(0.7))) == {}
+    told, updates = [], []
+    for _ in range(round(5.0 * RATE_HZ)):
+        updates = stage.show(aside(0.7))
+        told += stage.tracker.notes
+    assert subjects_of(updates) == {}
+    assert len(told) == 1 and "left out while a subject is missing" in told[0]
     assert subjects_of(stage.hold(0.5, SOMEBODY, aside(0.7))) == known
 
 

@@ -149,7 +149,6 @@ class Pipeline:
         self._pool = pool
         self._estimators: dict[str, Estimator] = {}
         self._removed: set[str] = set()
-        self._notes: list[str] = []
         self._now_ns: int | None = None
         self._looked_ns: int | None = None
         """When a camera last looked, at the latest at the first instant."""
@@ -172,7 +171,6 @@ class Pipeline:
             if name in self._models
         }
         self._now_ns = detections.timestamp_ns
-        self._notes.clear()
         updates = self._sort(detections, readings)
         followed = [update for update in updates if update.state is not TrackState.TENTATIVE]
         work = []
@@ -193,7 +191,7 @@ class Pipeline:
             updates=tuple(updates),
             estimates=tuple(estimate for estimate in results if estimate is not None),
             paired_anew=self._sorter.paired_anew if isinstance(self._sorter, Tracker) else {},
-            notes=tuple(self._notes),
+            notes=tuple(self._sorter.notes) if isinstance(self._sorter, Tracker) else (),
         )
         return self._step
 
@@ -303,7 +301,6 @@ class Pipeline:
             if isinstance(self._sorter, Tracker):
                 for name in self._sorter.paired_anew:
                     self._estimators.pop(name, None)
-                    self._notes.append(f"{name} is somebody else than was followed: sensors say so")
         sorted_names = {update.name for update in updates}
         if self._looked_ns is None or detections.looked is None or any(detections.looked):
             self._looked_ns = detections.timestamp_ns

@@ -63,6 +63,8 @@ class Cast:
         self._options = options
         self._places = [Place(name=s.name, named=True, start_m=s.start_m) for s in subjects]
         self._begun_ns: int | None = None
+        self.kept_out: list[Track] = []
+        """Who is established and has no place while a subject is missing."""
         self._single = len(rig) == 1
         self.size = options.max_subjects or len(subjects) or sys.maxsize
         """Subjects there may be at most."""
@@ -193,6 +195,7 @@ class Cast:
             and track.is_established(o)
             and self.inside(track)
         ]
+        self.kept_out = []
         if not newcomers:
             return
         known = [p for p in self._places if p.track or p.start_m]
@@ -212,6 +215,8 @@ class Cast:
         waiting = [p for p in self._places if not (p.live or p.track or p.start_m)]
         rest, waiting = self._admit_wearers(rest, waiting, tracks, now_ns, vote)
         chosen = rest[: len(waiting) + max(self._room(), 0)]
+        if any(p.track and not p.live for p in self._places):
+            self.kept_out = [track for track in rest if track not in chosen]
         for track in sorted(chosen, key=lambda t: t.track_id):
             if not waiting:
                 waiting.append(Place(name=self._free_name(), named=False, start_m=None))

@@ -42,6 +42,7 @@ class Track:
         "seen_ns",
         "strong_frames",
         "time_ns",
+        "told",
         "track_id",
         "triangulated_ns",
         "velocity",
@@ -76,6 +77,8 @@ class Track:
         """For how long two cameras or more have looked and no two seen it."""
         self.beside: dict[Track, float] = {}
         """Instants in which it and another were measured apart; of few views each counts less."""
+        self.told = False
+        """Whether a user knows that this person is left out."""
         self.replaced = False
         """Whether another track turned out to be who this one was thought to be."""
         self.dismissed = False

@@ -68,6 +68,8 @@ class Tracker:
         self._readings: Mapping[str, ImuReading] = {}
         self.paired_anew: dict[str, str] = {}
         """Whom sensors gave another track at the last instant, and whose it was before."""
+        self.notes: list[str] = []
+        """What a user should know of the last instant."""
 
     def hear(self, readings: Mapping[str, ImuReading]) -> None:
         """What subjects' sensors say at the instant of the next `update`."""
@@ -126,6 +128,17 @@ class Tracker:
         )
         self._cast.admit(everyone, now_ns, self._vote)
         self.paired_anew = self._cast.pair_anew(everyone, self._vote)
+        self.notes = [
+            f"{name} is somebody else than was followed: sensors say so"
+            for name in self.paired_anew
+        ]
+        for track in self._cast.kept_out:
+            if not track.told and (now_ns - track.born_ns) * 1e-9 >= self._options.patience_s:
+                track.told = True
+                self.notes.append(
+                    "somebody is left out while a subject is missing: all places are taken "
+                    "(max_subjects, or the people who are named)"
+                )
         self._population.tracks = [t for t in self._population.tracks if not t.replaced]
         self._last_ns = now_ns
         return self._report(views.local(person), measured, tracks, now_ns)
