@@ -108,7 +108,7 @@ def test_motion_of_the_database_is_retargeted(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [
-        (("nowhere.bvh", "--out", "x"), 1, "cannot read motion nowhere.bvh"),
+        (("nowhere.bvh", "--out", "x"), 1, "nowhere.bvh: no such file"),
         (("motion.fbx", "--out", "x"), 1, "expected a .bvh, an .amc"),
         (("{take}",), 2, "Missing option"),
         (("{take}", "--out", "."), 1, "name another folder"),

@@ -213,9 +213,9 @@ def test_sensors_of_one_recorder_keep_their_delays(tmp_path, monkeypatch):
 
     def read(path, **_):
         return ImuTrack(
-            times_s=np.arange(3) / 100,
-            orientation_wxyz=np.tile([1.0, 0, 0, 0], (3, 1)),
-            accel_m_s2=np.zeros((3, 3)),
+            times_s=np.arange(300) / 100,
+            orientation_wxyz=np.tile([1.0, 0, 0, 0], (300, 1)),
+            accel_m_s2=np.zeros((300, 3)),
             clock=SharedClock(start_s=starts[path.name], period_s=655.36),
         )
 

@@ -244,7 +244,10 @@ def _bounded(path: Path | str, kind: InputKind, value: Any) -> Any:
             elif isinstance(item, list):
                 below += item
             elif isinstance(item, int) and abs(item) >= 1 << 63:
-                raise kind.error(f"{path}: holds a whole number of {item.bit_length()} bits")
+                raise kind.error(
+                    f"{path}: holds a whole number of {item.bit_length()} bits; expected a number "
+                    "that fits into 64"
+                )
         if not below:
             return value
         level = below

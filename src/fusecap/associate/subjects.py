@@ -233,8 +233,8 @@ class Cast:
     ) -> tuple[list[Track], list[Place]]:
         """Places of whoever wears sensors go to whom they fit; who else may be admitted, and where.
 
-        A newcomer of whom sensors do not tell yet waits a while, then is admitted like others: who
-        was mistaken is paired anew later.
+        Where there are several a newcomer of whom sensors do not tell yet waits a while, then is
+        admitted like others: who was mistaken is paired anew later.
         """
         worn = [p for p in waiting if p.name in vote.heard]
         if not worn or not newcomers:
@@ -247,11 +247,12 @@ class Cast:
                 self._admit_to(worn[w], newcomers[n], tracks)
                 named.add(n)
         waiting = [p for p in waiting if not p.live]
-        found = all(p.live for p in worn)
+        undisputed = len(tracks) == 1 or all(p.live for p in worn)
         left = [
             t
             for n, t in enumerate(newcomers)
-            if n not in named and (found or (now_ns - t.born_ns) * 1e-9 >= self._options.patience_s)
+            if n not in named
+            and (undisputed or (now_ns - t.born_ns) * 1e-9 >= self._options.patience_s)
         ]
         return left, waiting
 

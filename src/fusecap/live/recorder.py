@@ -291,6 +291,8 @@ class _NameTaken(InputError):
 
 
 def _new_file(path: Path) -> BinaryIO:
+    if path.parent.exists() and not path.parent.is_dir():
+        raise InputError(f"cannot write {path}: {path.parent} is not a folder")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         free = shutil.disk_usage(path.parent).free

@@ -83,8 +83,7 @@ def command_message(command: Command) -> str:
 
 
 def tick_message(tick: Tick) -> str:
-    ahead = ',"ahead":true' if tick.ahead else ""
-    return f'{{"timestamp_ns":{tick.timestamp_ns}{ahead}}}'
+    return f'{{"timestamp_ns":{tick.timestamp_ns},"ahead":{json.dumps(tick.ahead)}}}'
 
 
 def pose_message(estimate: Estimate) -> str:

@@ -117,9 +117,10 @@ def read_record(folder: Path) -> DetectionRecord | None:
     path = folder / FILE_NAME
     if not path.exists():
         return None
-    data = read_json(path, DETECTION)
     try:
-        return _record(data)
+        return _record(read_json(path, DETECTION))
+    except InputError as error:
+        raise InputError(f"{error}; delete the folder and detect again") from None
     except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise InputError(
             f"{path}: cannot be read ({type(error).__name__}: {error}); expected the record of a "
