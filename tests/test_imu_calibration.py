@@ -1,5 +1,6 @@
 import importlib.util
 import json
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -494,12 +495,19 @@ def test_calibration_of_another_session_is_refused(recording, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_take_serves_instead_of_cameras(recording, tmp_path, monkeypatch, capsys):
-    arguments = [recording, "--take", recording / "truth.npz", "--optical"]
-    out = tmp_path / "imu.toml"
-    code, said = run(monkeypatch, capsys, *arguments, "--out", out)
-    assert code == 0 and out.is_file(), said.out + said.err
+def test_a_take_serves_instead_of_cameras_and_write_makes_the_session_use_it(
+    recording, tmp_path, monkeypatch, capsys
+):
+    folder = shutil.copytree(recording, tmp_path / "take")
+    monkeypatch.chdir(tmp_path)
+    arguments = ["take", "--take", "take/truth.npz", "--optical", "--write"]
+    code, said = run(monkeypatch, capsys, *arguments, "--out", "x.toml")
+    assert code == 2 and not Path("x.toml").exists()
+    code, said = run(monkeypatch, capsys, *arguments)
+    assert code == 0 and "session.toml uses it now" in said.out, said.out + said.err
     assert said.out.count("good") == 6
+    calibration = load_session(folder / "session.toml").settings.imu_calibration
+    assert calibration == folder / "imu_calibration.toml" and calibration.is_file()
 
 
 def test_misuse_and_missing_inputs_are_told(recording, tmp_path, monkeypatch, capsys):

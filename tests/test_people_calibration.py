@@ -291,11 +291,37 @@ def test_command_writes_a_calibration_that_the_session_can_use(rng, tmp_path):
     assert "calibration: " in again.stdout and "known to" in again.stdout
 
 
+@pytest.mark.slow
+def test_write_makes_the_session_use_the_refined_cameras(rng, tmp_path, monkeypatch):
+    """Of millimetres in a z-up world, from a folder that is not the session's."""
+    path, true = rough_session(tmp_path / "take", rng)
+    to_z_up = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    rough = load_rig(path.parent / "calibration.toml")
+    turned = Rig(
+        cameras=tuple(
+            dataclasses.replace(c, rotation=c.rotation @ to_z_up.T) for c in rough.cameras
+        )
+    )
+    (path.parent / "calibration.toml").write_text(calibration_toml(turned, unit_per_metre=1000.0))
+    edit(path, "[session]", '[session]\nup = "z"\ncalibration_unit = "mm"')
+    monkeypatch.chdir(tmp_path)
+    command = ["calibrate", "extrinsics", "--from-people", "take", "--write"]
+    result = CliRunner().invoke(app, command)
+    assert result.exit_code == 0 and "session.toml uses it now" in result.output, result.output
+    used = load_session(path).settings
+    assert (used.calibration, used.up) == (path.parent / "refined.toml", "y")
+    rig = opened(path).rig
+    shift_m, _ = motions(align(rig, true).similarity.rig(rig), true)
+    assert shift_m.max() < 5e-3
+    assert np.mean(motions(rig, rough)[0]) < 0.2
+
+
 def test_command_refuses_boards_and_people_at_once():
     command = ["calibrate", "extrinsics", "--from-people", "duo"]
     for more in (["left=a.mp4"], ["--board", "b.toml"], ["--refine", "focl"]):
         assert CliRunner().invoke(app, [*command, *more]).exit_code == 2
     assert CliRunner().invoke(app, [*command[:2], "--refine", "focal"]).exit_code == 2
+    assert CliRunner().invoke(app, [*command[:2], "left=a.mp4", "--write"]).exit_code == 2
 
 
 @pytest.mark.real_data

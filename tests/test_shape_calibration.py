@@ -12,6 +12,7 @@ from fusecap.calibrate import shape as module
 from fusecap.calibrate.shape import MeasuredBody, shape_toml
 from fusecap.cli import main
 from fusecap.sources.session import SubjectSettings
+from fusecap.sources.session_file import load_session
 from session_files import write_session
 
 LANDMARKS = landmark_set_named("body25")
@@ -153,6 +154,23 @@ def test_command_writes_subject_tables_and_a_plot(tmp_path, monkeypatch, capsys)
     assert report["bodies"][0]["name"] == "person1"
     assert tomllib.loads(out.read_text())["subject"][0]["height_m"] == pytest.approx(1.75, abs=0.1)
     assert out.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.slow
+def test_a_poor_body_is_not_written_into_the_session_and_a_good_one_is(
+    tmp_path, monkeypatch, capsys
+):
+    session = write_session(tmp_path, frames=60)
+    before = session.read_text()
+    assert run(monkeypatch, session, "--write") == 1
+    assert "stays as it is" in capsys.readouterr().out and session.read_text() == before
+    monkeypatch.setattr("fusecap.cli.calibrate_shape._problems", lambda found: [])
+    assert run(monkeypatch, session, "--write") == 0
+    assert "uses it now" in capsys.readouterr().out
+    [measured] = tomllib.loads((tmp_path / "shape.toml").read_text())["subject"]
+    [used] = load_session(session).subjects
+    assert (used.name, used.height_m) == ("person1", measured["height_m"])
+    assert used.bone_lengths_m == measured.get("bone_lengths_m", {})
 
 
 @pytest.mark.slow

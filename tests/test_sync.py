@@ -116,6 +116,8 @@ def test_cameras_of_different_rates_and_starts_are_found():
     found = clocks_of(rig, tracks(rig, walking, true_s, [30, 25, 50]))
     assert np.abs(found.offset_s - true_s).max() < 0.005
     assert np.all(np.abs(found.offset_s - true_s)[1:] < 4 * found.error_s[1:])
+    before_px, after_px = found.residual_px
+    assert np.all(before_px > 10) and np.all(after_px < 1), "as stated, not after a first guess"
 
 
 @pytest.mark.slow
@@ -445,7 +447,9 @@ def test_command_finds_cameras_and_sensors_of_the_simulated_demo(tmp_path, monke
         limit_s = 0.006 if row["kind"] == "camera" else 0.015
         assert row["offset_s"] == pytest.approx(true, abs=limit_s)
     assert (tmp_path / "sync.png").stat().st_size > 10_000
-    times_s = [track.times_s[0] for track in open_session(load_session(tmp_path)).keypoints]
+    session = load_session(tmp_path)
+    assert session.settings.sync == tmp_path / "sync.toml"
+    times_s = [track.times_s[0] for track in open_session(session).keypoints]
     assert np.ptp(times_s) < 0.012
 
 

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -379,6 +380,15 @@ class _Problem:
                     pair = np.ix_([bone, other], [bone, other])
                     precision[pair] += np.array([[1, -1], [-1, 1]]) / SYMMETRY_SIGMA_M**2
         return mean, precision
+
+
+def subject_keys(body: MeasuredBody) -> dict[str, Any]:
+    """What a session's [[subject]] says of this body, rounded to millimetres and tenths of them."""
+    keys: dict[str, Any] = {"height_m": round(body.height_m, 3)}
+    if body.lengths_m:
+        lengths = body.lengths_m.items()
+        keys["bone_lengths_m"] = {name: round(float(length), 4) for name, length in lengths}
+    return keys
 
 
 def shape_toml(bodies: Sequence[MeasuredBody], *, origin: str) -> str:

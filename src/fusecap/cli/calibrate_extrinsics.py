@@ -65,7 +65,10 @@ def extrinsics(
             "origin, y up. Without, the first camera is the world."
         ),
     ] = None,
-    out: Annotated[Path, typer.Option(help="The calibration to write.")] = Path("calibration.toml"),
+    out: Annotated[
+        Path | None,
+        typer.Option(help="The calibration to write; calibration.toml.", show_default=False),
+    ] = None,
     every: Every = None,
     seed: Annotated[int, typer.Option(help="Of the resampled instants.")] = 0,
     from_people: Annotated[
@@ -81,6 +84,13 @@ def extrinsics(
             "keypoints gain by it; repeat it."
         ),
     ] = None,
+    write: Annotated[
+        bool,
+        typer.Option(
+            "--write",
+            help="With --from-people: write refined.toml beside the session, and use it there.",
+        ),
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Where cameras stand to each other, from a board that several see at the same instants.
@@ -95,12 +105,16 @@ def extrinsics(
                 param_hint="--from-people",
             )
         calibrate_from_people.from_people(
-            from_people, out=out, refine=refine or (), as_json=as_json
+            from_people, out=out, write=write, refine=refine or (), as_json=as_json
         )
         return
     if refine:
         raise typer.BadParameter(
             "goes with --from-people; boards have --refine-intrinsics", param_hint="--refine"
+        )
+    if write:
+        raise typer.BadParameter(
+            "goes with --from-people; boards know no session", param_hint="--write"
         )
     from fusecap.calibrate.cameras.board import read_board
     from fusecap.calibrate.cameras.report import calibrate_rig
@@ -116,6 +130,7 @@ def extrinsics(
         raise typer.BadParameter(
             "expected two cameras or more; one camera has only intrinsics", param_hint="SOURCES"
         )
+    out = out or Path("calibration.toml")
     check_rig_path(out)
     target = read_board(board)
     with progress(quiet=as_json) as show:

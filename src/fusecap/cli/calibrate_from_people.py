@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from fusecap.cli.calibrations import print_verdict
+from fusecap.cli.calibrations import from_folder_of, output_of, print_use, print_verdict
 from fusecap.cli.common import check_choice, print_json
 from fusecap.cli.terminal import console, progress, table_of, wrote
 
@@ -21,13 +21,14 @@ REFINE = ("focal", "centre", "distortion")
 def from_people(
     session: Path,
     *,
-    out: Path,
+    out: Path | None,
+    write: bool = False,
     refine: Sequence[str] = (),
     as_json: bool = False,
 ) -> None:
     """Refine the session's cameras, report, and write them where held-out keypoints agree better.
 
-    Exit code 1, and nothing written, where they do not.
+    Exit code 1, and neither cameras nor session written, where they do not.
     """
     for name in refine:
         check_choice("--refine", name, REFINE)
@@ -36,15 +37,21 @@ def from_people(
     from fusecap.calibrate.pictures import plot_people
     from fusecap.sources.calibration_files.writer import check_rig_path, write_rig
     from fusecap.sources.session_data import open_session
+    from fusecap.sources.session_edit import edit_session
     from fusecap.sources.session_file import load_session
 
+    loaded = load_session(session)
+    out = output_of(loaded.path, out, write, "refined.toml" if write else "calibration.toml")
     check_rig_path(out)
     with progress(quiet=as_json) as show:
-        data = open_session(load_session(session), show)
+        data = open_session(loaded, show)
         found = refine_from_people(data, refine=refine, progress=show)
     files: list[Path] = []
     if found.improved:
         files += write_rig(out, found.rig, notes=_origin(found, data.session.settings.name))
+        if write:
+            values = {"calibration": out.name, "up": "y", "calibration_unit": None}
+            edit_session(loaded.path, values)
     picture = out.with_suffix(".png")
     plot_people(found, picture)
     files.append(picture)
@@ -54,10 +61,9 @@ def from_people(
         _print_report(found)
         wrote(*files)
         if found.improved:
-            console.print(
-                f'use it: under [session] calibration = "{out.name}" and up = "y"',
-                soft_wrap=True,
-            )
+            named = from_folder_of(loaded.path, out)
+            by_hand = f'under [session] calibration = "{named}" and up = "y", no calibration_unit'
+            print_use(loaded.path, write, by_hand)
     if not found.improved:
         raise typer.Exit(1)
 

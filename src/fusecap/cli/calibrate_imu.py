@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fusecap.cli.calibrations import coloured
+from fusecap.cli.calibrations import Write, coloured, from_folder_of, output_of, print_use
 from fusecap.cli.common import Json, SessionPath, check_choice, print_json
 from fusecap.cli.terminal import console, note, progress, remark, styled, table_of, wrote
 
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from fusecap.calibrate.imus.tpose import TPose
     from fusecap.sources.imu_calibration_files import CalibratedImu
 
-EXAMPLE = "Example: fusecap calibrate imu recordings/duo --out recordings/duo/imu_calibration.toml"
+EXAMPLE = "Example: fusecap calibrate imu recordings/duo --write"
 
 
 def imu(
@@ -36,9 +37,14 @@ def imu(
     identify: Annotated[
         bool, typer.Option("--identify", help="Only tell which sensor is on which bone.")
     ] = False,
-    out: Annotated[Path, typer.Option(help="The calibration to write; pictures go beside it.")] = (
-        Path("imu_calibration.toml")
-    ),
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="The calibration to write, imu_calibration.toml; pictures go beside it.",
+            show_default=False,
+        ),
+    ] = None,
+    write: Write = False,
     as_json: Json = False,
 ) -> None:
     """How sensors sit on their bones; a session uses the result as imu_calibration.
@@ -46,7 +52,6 @@ def imu(
     Residuals are measured on stretches of time that were left out.
     """
     from fusecap.calibrate.imus import session as calibration
-    from fusecap.files import check_writable
     from fusecap.sources.session_file import load_session
     from fusecap.take import load_take
 
@@ -60,11 +65,14 @@ def imu(
         raise typer.BadParameter(
             "needs --take: cameras do not observe all axes", param_hint="--optical"
         )
-    check_writable(out)
+    if identify and write:
+        raise typer.BadParameter("--identify changes nothing", param_hint="--write")
     loaded = load_session(session)
+    file = output_of(loaded.path, out, write, "imu_calibration.toml")
+    result = _Result(session=loaded.path, file=file, write=write, as_json=as_json)
     calibration.wearers(loaded)
     if source == "tpose":
-        _report_tpose(calibration.calibrate_from_tpose(loaded), out, as_json)
+        _report_tpose(calibration.calibrate_from_tpose(loaded), result)
         return
     with progress(quiet=as_json) as show:
         data = None if optical else calibration.camera_data(loaded, show)
@@ -78,10 +86,43 @@ def imu(
     if found is None:
         _report_identities(calibration.identify_sensors(loaded, reference), as_json)
     else:
-        _report(found, out, as_json)
+        _report(found, result)
 
 
-def _report(found: tuple[SubjectCalibration, ...], out: Path, as_json: bool) -> None:
+@dataclass(frozen=True, kw_only=True)
+class _Result:
+    """Where the calibration goes, and who is told."""
+
+    session: Path
+    file: Path
+    write: bool
+    """Whether the session is made to use it."""
+    as_json: bool
+
+    def save(self, imus: list[CalibratedImu], origin: str) -> list[Path]:
+        """The files written; none without sensors."""
+        from fusecap.files import write_whole
+        from fusecap.sources.imu_calibration_files import imu_calibration_toml
+        from fusecap.sources.session_edit import edit_session
+
+        if not imus:
+            return []
+        write_whole(self.file, imu_calibration_toml(imus, origin=origin))
+        if self.write:
+            edit_session(self.session, {"imu_calibration": self.file.name})
+        return [self.file]
+
+    def print(self, files: list[Path]) -> None:
+        wrote(*files)
+        if files:
+            named = from_folder_of(self.session, self.file)
+            by_hand = f'imu_calibration = "{named}" under [session]'
+            print_use(self.session, self.write, by_hand)
+        else:
+            remark(("nothing was written", "red"), "no sensor could be calibrated")
+
+
+def _report(found: tuple[SubjectCalibration, ...], result: _Result) -> None:
     from dataclasses import asdict
 
     from fusecap.calibrate.imus.session import calibrated_imus
@@ -90,13 +131,13 @@ def _report(found: tuple[SubjectCalibration, ...], out: Path, as_json: bool) -> 
 
     imus = calibrated_imus(found)
     seconds = ", ".join(f"{each.duration_s:.1f} s of '{each.subject}'" for each in found)
-    files = _write(imus, out, f"motion: {seconds}")
+    files = result.save(imus, f"motion: {seconds}")
     for each in found:
         if each.sensors:
-            picture = out.with_name(f"{out.stem}_{safe_name(each.subject)}.png")
+            picture = result.file.with_name(f"{result.file.stem}_{safe_name(each.subject)}.png")
             plot_sensors(each, picture)
             files.append(picture)
-    if as_json:
+    if result.as_json:
         subjects = [
             {key: value for key, value in asdict(each).items() if key != "series"} for each in found
         ]
@@ -104,7 +145,7 @@ def _report(found: tuple[SubjectCalibration, ...], out: Path, as_json: bool) -> 
     else:
         for each in found:
             _print_subject(each)
-        _print_files(files, imus, out)
+        result.print(files)
     if not imus:
         raise typer.Exit(1)
 
@@ -214,10 +255,10 @@ def _report_identities(found: dict[str, tuple[Identity, ...]], as_json: bool) ->
     )
 
 
-def _report_tpose(found: list[tuple[CalibratedImu, TPose]], out: Path, as_json: bool) -> None:
+def _report_tpose(found: list[tuple[CalibratedImu, TPose]], result: _Result) -> None:
     imus = [imu for imu, pose in found if not pose.complaints]
-    files = _write(imus, out, "T-pose")
-    if as_json:
+    files = result.save(imus, "T-pose")
+    if result.as_json:
         rows = [
             {
                 "subject": imu.subject,
@@ -233,7 +274,7 @@ def _report_tpose(found: list[tuple[CalibratedImu, TPose]], out: Path, as_json: 
         print_json({"imus": rows, "files": [str(file) for file in files]})
     else:
         _print_tpose(found)
-        _print_files(files, imus, out)
+        result.print(files)
     if not imus:
         raise typer.Exit(1)
 
@@ -261,21 +302,3 @@ def _print_tpose(found: list[tuple[CalibratedImu, TPose]]) -> None:
         "  R_ib is as exact as the subject's T-pose; check it on motion with --from motion",
         soft_wrap=True,
     )
-
-
-def _write(imus: list[CalibratedImu], out: Path, origin: str) -> list[Path]:
-    from fusecap.files import write_whole
-    from fusecap.sources.imu_calibration_files import imu_calibration_toml
-
-    if not imus:
-        return []
-    write_whole(out, imu_calibration_toml(imus, origin=origin))
-    return [out]
-
-
-def _print_files(files: list[Path], imus: list[Any], out: Path) -> None:
-    wrote(*files)
-    if imus:
-        console.print(f'use it: imu_calibration = "{out.name}" under [session]', soft_wrap=True)
-    else:
-        remark(("nothing was written", "red"), "no sensor could be calibrated")

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fusecap.calibrate.verdict import Verdict
-from fusecap.cli.calibrations import print_verdict
+from fusecap.cli.calibrations import Write, output_of, print_use, print_verdict
 from fusecap.cli.common import Json, SessionPath, print_json
 from fusecap.cli.terminal import console, progress, table_of, wrote
 
 if TYPE_CHECKING:
     from fusecap.calibrate.shape import MeasuredBody, ShapeCalibration
 
-EXAMPLE = "Example: fusecap calibrate shape recordings/rom --subject anna --out anna.toml"
+EXAMPLE = "Example: fusecap calibrate shape recordings/rom --subject anna --write"
 _LIMBS = tuple(
     f"{side}_{bone}" for side in ("left", "right") for bone in ("forearm", "hand", "shank", "foot")
 )
@@ -26,27 +26,35 @@ def shape(
     session: SessionPath,
     subject: Annotated[str | None, typer.Option(help="Only this person.")] = None,
     out: Annotated[
-        Path, typer.Option(help="Subject tables to write; a plot goes beside, as .png.")
-    ] = Path("shape.toml"),
+        Path | None,
+        typer.Option(
+            help="Subject tables to write, shape.toml; a plot goes beside, as .png.",
+            show_default=False,
+        ),
+    ] = None,
+    write: Write = False,
     as_json: Json = False,
 ) -> None:
     """Bone lengths from a recording in which every joint bends, with their uncertainty.
 
-    Measures on the first three quarters of the session and checks the result on the rest.
+    Measures on the first three quarters of the session and checks the result on the rest. With
+    --write a poor result leaves session.toml as it is, exit code 1.
     """
     from dataclasses import asdict
 
     from fusecap.batch.solve import SessionInstants
     from fusecap.calibrate.pictures import plot_bodies
-    from fusecap.calibrate.shape import calibrate_shape, shape_toml
-    from fusecap.files import check_writable, write_whole
+    from fusecap.calibrate.shape import calibrate_shape, shape_toml, subject_keys
+    from fusecap.files import write_whole
     from fusecap.setup import setup_of
     from fusecap.sources.session_data import open_session
+    from fusecap.sources.session_edit import edit_session
     from fusecap.sources.session_file import load_session
 
-    check_writable(out)
+    loaded = load_session(session)
+    out = output_of(loaded.path, out, write, "shape.toml")
     with progress(quiet=as_json) as show:
-        data = open_session(load_session(session), show)
+        data = open_session(loaded, show)
         found = calibrate_shape(
             setup_of(data.session, data.rig, data.landmarks),
             lambda first, end: SessionInstants(data, first, end),
@@ -60,7 +68,15 @@ def shape(
     picture = out.with_suffix(".png")
     plot_bodies(found.bodies, picture)
     problems = _problems(found)
+    if write and not loaded.subjects and len(found.bodies) > 1:
+        problems.append(
+            f"{len(found.bodies)} people and no [[subject]] to tell them by; add one for each, "
+            "with name and start_m, and run again"
+        )
     verdict = Verdict.POOR if problems else Verdict.GOOD
+    used = write and not problems
+    if used:
+        edit_session(loaded.path, subjects={body.name: subject_keys(body) for body in found.bodies})
     if as_json:
         bodies = [
             {key: value for key, value in vars(body).items() if key not in ("shape", "bones")}
@@ -77,7 +93,19 @@ def shape(
                 "files": [str(out), str(picture)],
             }
         )
-        return
+    else:
+        _print_report(found, verdict, problems)
+        wrote(out, picture)
+        if write and problems:
+            console.print(f"{loaded.path} stays as it is", soft_wrap=True)
+        else:
+            by_hand = "copy height_m and bone_lengths_m into the session's [[subject]]"
+            print_use(loaded.path, used, by_hand)
+    if write and problems:
+        raise typer.Exit(1)
+
+
+def _print_report(found: ShapeCalibration, verdict: Verdict, problems: list[str]) -> None:
     for body in found.bodies:
         _print_body(body)
     before, after = found.held_out_before_px, found.held_out_after_px
@@ -87,8 +115,6 @@ def shape(
         soft_wrap=True,
     )
     print_verdict("bodies", verdict, problems)
-    wrote(out, picture)
-    console.print("use it: copy height_m and bone_lengths_m into the session's [[subject]]")
 
 
 def _problems(found: ShapeCalibration) -> list[str]:

@@ -43,6 +43,7 @@ def sync(
 
     from fusecap.calibrate.sync.session import synchronise
     from fusecap.files import check_writable, write_whole
+    from fusecap.sources.session_edit import edit_session
     from fusecap.sources.session_file import missing_files, parse_session
     from fusecap.sources.sync_files import sync_toml
 
@@ -55,6 +56,7 @@ def sync(
         raise InputError("\n".join(f"{opened.path}: {line}" for line in missing))
     if write:
         out = opened.path.parent / "sync.toml"
+        check_writable(opened.path)
     for file in (out, picture):
         if file is not None:
             check_writable(file)
@@ -66,7 +68,7 @@ def sync(
         draw(found, picture)
     if out is not None:
         write_whole(out, sync_toml(found.clocks, origin=_origin(found)))
-    named = _name(opened.path) if write else False
+    named = write and edit_session(opened.path, {"sync": "sync.toml"})
     if as_json:
         print_json(
             {
@@ -99,24 +101,8 @@ def _origin(found: Synchronisation) -> str:
     return f"{cameras} cameras, {imus} IMU clocks; reference camera {found.reference}"
 
 
-def _name(path: Path) -> bool:
-    """Adds `sync = "sync.toml"` below [session] unless a sync is named; whether it did."""
-    import re
-
-    from fusecap.files import write_whole
-    from fusecap.inputs import SESSION, read_text, read_toml
-
-    text = read_text(path, SESSION)
-    if "sync" in read_toml(path, SESSION).get("session", {}):
-        return False
-    changed = re.sub(
-        r"^(\s*\[\s*session\s*\][^\n]*)$", r'\1\nsync = "sync.toml"', text, count=1, flags=re.M
-    )
-    write_whole(path, changed)
-    return True
-
-
 def _print_report(found: Synchronisation) -> None:
+    import numpy as np
 
     table = table_of("clock", "offset ms", "error ms", "drift ms/min", "verdict")
     for column in table.columns[1:4]:
@@ -129,12 +115,15 @@ def _print_report(found: Synchronisation) -> None:
         "much later than the session's. Errors are standard errors.",
         soft_wrap=True,
     )
-    if found.cameras is not None and found.cameras.refined:
+    if found.cameras is not None:
         before, after = found.cameras.residual_px
-        if before == before:
+        gain = np.nan_to_num(before - after)
+        most = int(np.argmax(gain))
+        if gain[most] >= 0.1:
             console.print(
-                f"  views disagree by {before:.1f} -> {after:.1f} px (median, of an image 1920 "
-                "wide)",
+                f"  camera '{found.rows[most].name}' gains most: from the others' lines its "
+                f"keypoints are {before[most]:.1f} -> {after[most]:.1f} px away (median, of an "
+                "image 1920 wide)",
                 soft_wrap=True,
             )
     for name, stamp in found.stamps.items():

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 
 from fusecap.calibrate.verdict import Verdict
 from fusecap.cli.common import json_text
 from fusecap.cli.terminal import console, err, styled
-from fusecap.files import write_whole
+from fusecap.files import check_writable, write_whole
 
+Write = Annotated[
+    bool,
+    typer.Option("--write", help="Write beside the session, and make session.toml use the result."),
+]
 _COLOURS = {Verdict.GOOD: "green", Verdict.USABLE: "yellow", Verdict.POOR: "red"}
 
 
@@ -26,6 +31,33 @@ def print_verdict(what: str, verdict: Verdict, advice: Iterable[str]) -> None:
     console.print(styled(what, ": ", coloured(verdict)))
     for remedy in advice:
         err.print(f"{what}: {remedy}", soft_wrap=True)
+
+
+def output_of(session: Path, out: Path | None, write: bool, name: str) -> Path:
+    """Where a result goes: as stated, or called `name`, with --write beside the session file.
+
+    Misuse exits with 2; raises `TakeError` where nothing could be written.
+    """
+    if write and out is not None:
+        raise typer.BadParameter("give --out or --write, not both", param_hint="--out")
+    if write:
+        check_writable(session)
+    path = session.parent / name if write else out or Path(name)
+    check_writable(path)
+    return path
+
+
+def from_folder_of(session: Path, file: Path) -> str:
+    """A file as the session names it: from its own folder, with forward slashes."""
+    return Path(os.path.relpath(file.resolve(), session.resolve().parent)).as_posix()
+
+
+def print_use(session: Path, write: bool, by_hand: str) -> None:
+    """What makes a session use the result, or that it does."""
+    console.print(
+        f"{session} uses it now" if write else f"use it: {by_hand}; or run with --write",
+        soft_wrap=True,
+    )
 
 
 def named_sources(sources: list[str]) -> dict[str, str]:

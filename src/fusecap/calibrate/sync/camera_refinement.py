@@ -94,7 +94,9 @@ class Refined:
     error_s: Float[np.ndarray, " c"]
     drift_error: Float[np.ndarray, " c"]
     middle_s: Float[np.ndarray, " c"]
-    residual_px: tuple[float, float]
+    residual_px: tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]
+    """Each camera's median distance from the lines of the others, on the times as they were and as
+    found, cameras standing where they were found both times; NaN where views share too little."""
 
 
 class _Equations:
@@ -173,7 +175,6 @@ class _Equations:
             gradient=np.concatenate(gradients),
             block=blocks_of(np.concatenate(at_s)),
             cluster=np.concatenate(clusters),
-            median_px=median_px,
         )
 
     def _derivatives(
@@ -213,6 +214,16 @@ class _Equations:
             self.rig, self.views, pair, self.offset_s, self.drift, self.middle_s, self.poses
         )
 
+    def distances_px(self) -> Float[np.ndarray, " c"]:
+        """Each camera's median distance in its pairs, where the unknowns are."""
+        by_camera: list[list[Float[np.ndarray, " n"]]] = [[] for _ in self.views]
+        for pair in self.pairs:
+            r = _sampson_px(essential_of(self.rig, pair, self.poses), self._match(pair))
+            for camera in pair:
+                by_camera[camera].append(np.abs(r))
+        pooled = [np.concatenate(some) if some else np.empty(0) for some in by_camera]
+        return np.array([np.median(r) if len(r) else np.nan for r in pooled])
+
     def true_slope(self, here: _System) -> Float[np.ndarray, "p p"]:
         """`here.slope` with its columns of clocks by finite differences.
 
@@ -237,14 +248,13 @@ class _Equations:
 
 @dataclass(frozen=True, kw_only=True)
 class _System:
-    """Equations of P unknowns from N measurements, and what they say of the residuals."""
+    """Equations of P unknowns from N measurements."""
 
     slope: Float[np.ndarray, "p p"]
     right: Float[np.ndarray, " p"]
     gradient: Float[np.ndarray, "n p"]
     block: Int[np.ndarray, " n"]
     cluster: Int[np.ndarray, " n"]
-    median_px: float
 
 
 def refine(
@@ -258,7 +268,6 @@ def refine(
     """All finite offsets together; the reference keeps its own."""
     equations = _Equations(rig, views, offset_s, reference)
     covariance = np.full((equations.size, equations.size), np.nan)
-    before = after = float("nan")
     slope: Float[np.ndarray, "p p"] | None = None
     for step in range(_STEPS + _LAST_STEPS):
         if progress:
@@ -266,7 +275,6 @@ def refine(
         here = equations.evaluate()
         if here is None:
             break
-        before, after = here.median_px if step == 0 else before, here.median_px
         if step == _STEPS:
             slope = equations.true_slope(here)
             covariance = clustered_covariance(here.gradient, slope, here.block, here.cluster)
@@ -282,13 +290,16 @@ def refine(
         error[camera] = _root(covariance[column, column])
     for camera, column in equations.drift_column.items():
         drift_error[camera] = _root(covariance[column, column])
+    found_s, drift, after_px = equations.offset_s, equations.drift, equations.distances_px()
+    equations.offset_s = np.where(np.isfinite(found_s), 0.0, np.nan)
+    equations.drift = np.zeros(len(views))
     return Refined(
-        offset_s=equations.offset_s,
-        drift=np.where(np.isfinite(drift_error), equations.drift, np.nan),
+        offset_s=found_s,
+        drift=np.where(np.isfinite(drift_error), drift, np.nan),
         error_s=error,
         drift_error=drift_error,
         middle_s=equations.middle_s,
-        residual_px=(before, after),
+        residual_px=(equations.distances_px(), after_px),
     )
 
 

@@ -63,8 +63,9 @@ class CameraClocks:
     curves: tuple[Curve | None, ...]
     refined: bool
     """Whether a calibration allowed the second search."""
-    residual_px: tuple[float, float]
-    """Median distance from the lines before and after, image 1920 wide; NaN where not refined."""
+    residual_px: tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]
+    """Median distance from the others' lines on the times as stated and as found, image 1920 wide;
+    NaN where not refined."""
 
 
 def joint_offsets(
@@ -318,7 +319,7 @@ def synchronise_cameras(
             peaks=peaks,
             curves=tuple(own),
             refined=False,
-            residual_px=(float("nan"), float("nan")),
+            residual_px=(nothing, nothing),
         )
     fine = refine(rig, views, offset_s, reference, progress=progress)
     return CameraClocks(
