@@ -35,6 +35,7 @@ def session(tmp_path_factory) -> Path:
         ("demo",),
         ("solve",),
         ("export",),
+        ("angles",),
         ("doctor",),
         ("live",),
         ("view",),

@@ -9,6 +9,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from fusecap.angles.joint_angles import JointAngles as JointAngles
+    from fusecap.angles.joint_angles import joint_angles as joint_angles
     from fusecap.associate.options import TrackerOptions as TrackerOptions
     from fusecap.associate.tracker import Tracker as Tracker
     from fusecap.batch.solve import Solved as Solved

@@ -114,6 +114,11 @@ EXTENDED23 = _build(
 )
 """`PAPER21` with clavicles, 72 degrees of freedom."""
 
+ELBOW_HINGE = np.array([0.0, np.cos(np.radians(30.0)), -np.sin(np.radians(30.0))])
+"""In the upper arm's frame. With arms to the sides and palms down the elbow's pit faces forward and
+30 deg up in every skeleton of the CMU motion capture database, from which the pose prior is; people
+differ."""
+
 SKELETONS = {skeleton.name: skeleton for skeleton in (PAPER21, EXTENDED23)}
 
 

@@ -15,6 +15,7 @@ from typing import Annotated
 import typer
 
 from fusecap.cli import (
+    angles,
     calibrate_board,
     calibrate_extrinsics,
     calibrate_imu,
@@ -80,6 +81,7 @@ app.command(epilog=detect.EXAMPLE)(detect.detect)
 app.command(epilog=solve.EXAMPLE)(solve.solve)
 app.command(epilog=edit.EXAMPLE)(edit.edit)
 app.command(epilog=export.EXAMPLE)(export.export)
+app.command(epilog=angles.EXAMPLE)(angles.angles)
 app.command(epilog=retarget.EXAMPLE)(retarget.retarget)
 app.command(epilog=doctor.EXAMPLE)(doctor.doctor)
 app.command(epilog=init.EXAMPLE)(init.init)

@@ -10,6 +10,8 @@ flexion forward, adduction and inward rotation are positive, and so is a bent kn
 
 from __future__ import annotations
 
+import io
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -124,6 +126,24 @@ def coordinate_values(take: Take) -> tuple[list[str], Float[np.ndarray, "t c"]]:
             names += TRANSLATIONS
             columns.append(motion.position_m[:, 0] @ OPENSIM_FROM_OURS.T)
     return names, np.concatenate(columns, axis=1)
+
+
+def motion_table(
+    title: str, names: Sequence[str], time_s: Float[np.ndarray, " t"], deg: Float[np.ndarray, "t c"]
+) -> str:
+    """The text of a MOT file of columns in degrees (and metres)."""
+    head = [
+        title,
+        "version=1",
+        f"nRows={len(time_s)}",
+        f"nColumns={1 + len(names)}",
+        "inDegrees=yes",
+        "endheader",
+        "\t".join(("time", *names)),
+    ]
+    table = io.StringIO()
+    np.savetxt(table, np.column_stack([time_s, deg]), fmt="%.6f", delimiter="\t")
+    return "\n".join(head) + "\n" + table.getvalue()
 
 
 def opensim_markers(shape: BodyShape, rest: RestRig) -> list[OpensimMarker]:

@@ -27,7 +27,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from fusecap.body.landmarks import LandmarkSet
-from fusecap.body.skeleton import Skeleton
+from fusecap.body.skeleton import ELBOW_HINGE, Skeleton
 from fusecap.take import Take
 
 LANDMARK_SIGMA_M = 0.02
@@ -37,10 +37,6 @@ OPTICAL_SIGMA_RAD = np.radians(3.0)
 MAX_RATE_HZ = 20.0
 """Instants closer together tell nothing new."""
 
-ELBOW_HINGE = np.array([0.0, np.cos(np.radians(30.0)), -np.sin(np.radians(30.0))])
-"""In the upper arm's frame. With arms to the sides and palms down the elbow's pit faces forward and
-30 deg up in every skeleton of the CMU motion capture database, from which the pose prior is; people
-differ."""
 KNEE_HINGE = np.array([1.0, 0.0, 0.0])
 """In the thigh's frame and, but for `_joint`'s looseness, in the shank's."""
 

@@ -1,0 +1,1 @@
+"""Joint angles as biomechanists publish them, with error bars; see docs/angles.md."""

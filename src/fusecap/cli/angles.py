@@ -1,0 +1,120 @@
+"""`fusecap angles`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from fusecap.cli.common import Json, print_json
+from fusecap.cli.terminal import console, note, table_of, wrote
+from fusecap.errors import InputError, TakeError
+
+EXAMPLE = "Example: fusecap angles duo/duo.npz --out duo/angles.csv --mot --plot --gait"
+
+
+def angles(
+    take: Annotated[
+        Path, typer.Argument(help="A solved take (.npz), or the recording (.mcap) of a live run.")
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="The table to write; default <take>_angles.csv.")
+    ] = None,
+    mot: Annotated[bool, typer.Option("--mot", help="Also one MOT a person, for OpenSim.")] = False,
+    plot: Annotated[
+        bool, typer.Option("--plot", help="Also one picture per person, with bands of one sd.")
+    ] = False,
+    gait: Annotated[
+        bool,
+        typer.Option(
+            "--gait",
+            help="Also the legs from foot strike to foot strike: mean and band.",
+        ),
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Joint angles by ISB conventions, in degrees, each with one standard deviation.
+
+    Hips, knees, ankles, shoulders, elbows, wrists, trunk and neck; docs/angles.md says about which
+    axes, and what is positive.
+    """
+    from fusecap.angles.gait import gait_cycles
+    from fusecap.angles.joint_angles import joint_angles
+    from fusecap.batch.replay import open_take
+    from fusecap.exports import angle_files
+    from fusecap.files import distinct_names
+
+    target = out or take.with_name(f"{take.stem}_angles.csv")
+    if target.suffix != ".csv":
+        raise InputError(f"--out {target}: the table of angles is a .csv file")
+    opened = open_take(take)
+    people = np.flatnonzero(opened.tracked.any(axis=1)).tolist()
+    if not people:
+        raise TakeError(f"{take}: nobody is tracked in any frame of the take: there are no angles")
+    found = joint_angles(opened)
+    angle_files.write_angles_csv(found, target)
+    files = [target]
+    names = distinct_names(found.subject_names)
+
+    def beside(row: int, ending: str) -> Path:
+        files.append(target.with_name(f"{target.stem}_{names[row]}{ending}"))
+        return files[-1]
+
+    if mot:
+        for row in people:
+            angle_files.write_angles_mot(found, row, beside(row, ".mot"))
+    if plot:
+        from fusecap.exports.angle_plot import plot_angles
+
+        for row in people:
+            plot_angles(found, row, beside(row, ".png"))
+    cycles: dict[str, dict[str, int]] = {}
+    if gait:
+        from fusecap.exports.angle_plot import plot_gait
+
+        walks = {
+            row: [gait_cycles(opened, found, row, side) for side in ("left", "right")]
+            for row in people
+        }
+        files.append(target.with_name(f"{target.stem}_gait.csv"))
+        angle_files.write_gait_csv(
+            [(found.subject_names[row], each) for row, sides in walks.items() for each in sides],
+            files[-1],
+        )
+        for row, sides in walks.items():
+            name = found.subject_names[row]
+            cycles[name] = {each.side: len(each.deg) for each in sides}
+            if any(cycles[name].values()):
+                plot_gait(sides, beside(row, "_gait.png"))
+            else:
+                note(f"'{name}' has no gait cycle: no foot strikes twice, 0.5 to 2.5 s apart")
+    summary = {
+        found.subject_names[row]: _summary(found.names, found.deg[row], found.sd_deg[row])
+        for row in people
+    }
+    if as_json:
+        result: dict[str, Any] = {"files": [str(path) for path in files], "people": summary}
+        print_json(result | ({"gait_cycles": cycles} if gait else {}))
+        return
+    for name, rows in summary.items():
+        table = table_of("angle [deg]", "min", "median", "max", "sd", title=name)
+        for angle, row in rows.items():
+            table.add_row(angle, *(f"{row[key]:.1f}" for key in ("min", "median", "max", "sd")))
+        console.print(table)
+    wrote(*files)
+
+
+def _summary(names: tuple[str, ...], deg: np.ndarray, sd_deg: np.ndarray) -> dict[str, Any]:
+    """Per angle its least, median and largest value and its median standard deviation [deg]."""
+    seen = np.isfinite(deg).all(axis=1)
+    return {
+        name: {
+            "min": float(curve.min()),
+            "median": float(np.median(curve)),
+            "max": float(curve.max()),
+            "sd": float(np.median(sd)),
+        }
+        for name, curve, sd in zip(names, deg[seen].T, sd_deg[seen].T, strict=True)
+    }
