@@ -1,7 +1,8 @@
 """Our own CSV: `time_s,qw,qx,qy,qz,ax,ay,az`, further columns ignored (docs/formats.md).
 
 The quaternion is imu_world_from_imu; acceleration is specific force in the imu frame [m/s²], and
-may be left out or NaN. Times may also be `time_ms`, `time_us` or `time_ns`, and count from 1970.
+may be left out or NaN. Without quaternions: `Gyr_X..Z` [rad/s], `Acc_X..Z` and perhaps `Mag_X..Z`
+of the raw sensor. Times may also be `time_ms`, `time_us` or `time_ns`, and count from 1970.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from pathlib import Path
 
 from fusecap.errors import InputError
 from fusecap.sources.imu_files.loader import ImuFormat
+from fusecap.sources.imu_files.raw import orientation_from_raw
 from fusecap.sources.imu_files.table import read_table
 from fusecap.sources.imu_files.track import ImuTrack, since_first, tidy
 
@@ -23,15 +25,27 @@ def read(path: Path, _sensor: str | None, _rate_hz: float | None) -> ImuTrack:
     if unit is None:
         raise InputError(f"{path}: no column {' or '.join(_SECONDS)}, found {table.columns[:1]}")
     times_s, clock = since_first(table.take([unit])[:, 0] * _SECONDS[unit])
-    accelerations, notes = table.accelerations(["ax", "ay", "az"])
+    quaternion = ["qw", "qx", "qy", "qz"]
+    raw = None
+    if not table.has(quaternion):
+        raw = orientation_from_raw(table, times_s, rad_s=1.0)
+    if raw is not None:
+        orientation_wxyz, said = raw
+        accelerations, notes = table.accelerations(["Acc_X", "Acc_Y", "Acc_Z"])
+    else:
+        orientation_wxyz, said = table.take(quaternion), ()
+        accelerations, notes = table.accelerations(["ax", "ay", "az"])
     return tidy(
         str(path),
         times_s,
-        table.take(["qw", "qx", "qy", "qz"]),
+        orientation_wxyz,
         accelerations,
         clock=clock,
-        notes=notes,
+        notes=(*said, *notes),
     )
 
 
-FORMAT = ImuFormat(read=read, marks=tuple(f"{time},qw" for time in _SECONDS))
+FORMAT = ImuFormat(
+    read=read,
+    marks=tuple(f"{time},{second}" for time in _SECONDS for second in ("qw", "Gyr_X", "Acc_X")),
+)

@@ -4,6 +4,7 @@ Orientation is imu_world (z up) from imu, as one of
     Quat_q0..q3                w, x, y, z
     Mat[1][1]..Mat[3][3]       Mat[row][column], listed column by column
     Roll, Pitch, Yaw           degrees; Rz(yaw) Ry(pitch) Rx(roll)
+    Gyr_X..Z                   rad/s, with Acc_X..Z and perhaps Mag_X..Z: see `raw`
 `Acc_X..Z` is specific force in the imu frame. Time is `PacketCounter` (16 bits, common to the
 sensors of one recording) over the update rate.
 """
@@ -17,6 +18,7 @@ import numpy as np
 
 from fusecap.errors import InputError
 from fusecap.sources.imu_files.loader import ImuFormat
+from fusecap.sources.imu_files.raw import orientation_from_raw
 from fusecap.sources.imu_files.table import ImuTable, read_table
 from fusecap.sources.imu_files.track import (
     ImuTrack,
@@ -46,13 +48,15 @@ def read(path: Path, _sensor: str | None, rate_hz: float | None) -> ImuTrack:
         raise InputError(f"{path}: PacketCounter is empty; export it, it is the time of a sample")
     first = float(np.nanmin(packets))
     accelerations, notes = table.accelerations(["Acc_X", "Acc_Y", "Acc_Z"])
+    times_s = (packets - first) / rate
+    orientation_wxyz, said = _orientation_wxyz(table, times_s)
     return tidy(
         str(path),
-        (packets - first) / rate,
-        _orientation_wxyz(table),
+        times_s,
+        orientation_wxyz,
         accelerations,
         clock=SharedClock(start_s=first / rate, period_s=PACKET_MODULUS / rate),
-        notes=notes,
+        notes=(*said, *notes),
     )
 
 
@@ -68,17 +72,20 @@ def _rate_hz(table: ImuTable, stated_hz: float | None) -> float:
     return stated_hz
 
 
-def _orientation_wxyz(table: ImuTable) -> np.ndarray:
+def _orientation_wxyz(table: ImuTable, times_s: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
     if table.has(_QUATERNION):
-        return table.take(_QUATERNION)
+        return table.take(_QUATERNION), ()
     if table.has(_MATRIX):
-        return wxyz_of_matrices(table.take(_MATRIX).reshape(-1, 3, 3))
+        return wxyz_of_matrices(table.take(_MATRIX).reshape(-1, 3, 3)), ()
     if table.has(_EULER_XYZ):
-        return wxyz_of_euler(table.take(_EULER_XYZ))
+        return wxyz_of_euler(table.take(_EULER_XYZ)), ()
+    raw = orientation_from_raw(table, times_s, rad_s=1.0)
+    if raw is not None:
+        return raw
     raise InputError(
         f"{table.path}: no orientation; export quaternions (Quat_q0..3), the rotation matrix "
         "(Mat[1][1]..) or Euler angles (Roll, Pitch, Yaw) from MT Manager"
     )
 
 
-FORMAT = ImuFormat(read=read, marks=("Quat_q0", "Mat[1][1]", "Roll,Pitch"))
+FORMAT = ImuFormat(read=read, marks=("Quat_q0", "Mat[1][1]", "Roll,Pitch", "PacketCounter,Acc_X"))
