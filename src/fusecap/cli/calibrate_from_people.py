@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from fusecap.cli.calibrations import from_folder_of, output_of, print_use, print_verdict
+from fusecap.cli.calibrations import (
+    check_stated,
+    from_folder_of,
+    output_of,
+    print_use,
+    print_verdict,
+)
 from fusecap.cli.common import check_choice, print_json
 from fusecap.cli.terminal import console, progress, table_of, wrote
 
@@ -40,9 +46,11 @@ def from_people(
     from fusecap.sources.session_edit import edit_session
     from fusecap.sources.session_file import load_session
 
+    check_stated(out, write)
+    if out is not None:
+        check_rig_path(out)
     loaded = load_session(session)
     out = output_of(loaded.path, out, write, "refined.toml" if write else "calibration.toml")
-    check_rig_path(out)
     with progress(quiet=as_json) as show:
         data = open_session(loaded, show)
         found = refine_from_people(data, refine=refine, progress=show)

@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fusecap.cli.calibrations import Write, coloured, from_folder_of, output_of, print_use
+from fusecap.cli.calibrations import (
+    Write,
+    check_stated,
+    coloured,
+    from_folder_of,
+    output_of,
+    print_use,
+)
 from fusecap.cli.common import Json, SessionPath, check_choice, print_json
 from fusecap.cli.terminal import console, note, progress, remark, styled, table_of, wrote
 
@@ -67,6 +74,7 @@ def imu(
         )
     if identify and write:
         raise typer.BadParameter("--identify changes nothing", param_hint="--write")
+    check_stated(out, write)
     loaded = load_session(session)
     file = output_of(loaded.path, out, write, "imu_calibration.toml")
     result = _Result(session=loaded.path, file=file, write=write, as_json=as_json)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fusecap.calibrate.verdict import Verdict
-from fusecap.cli.calibrations import Write, output_of, print_use, print_verdict
+from fusecap.cli.calibrations import Write, check_stated, output_of, print_use, print_verdict
 from fusecap.cli.common import Json, SessionPath, print_json
 from fusecap.cli.terminal import console, progress, table_of, wrote
 
@@ -51,6 +51,7 @@ def shape(
     from fusecap.sources.session_edit import edit_session
     from fusecap.sources.session_file import load_session
 
+    check_stated(out, write)
     loaded = load_session(session)
     out = output_of(loaded.path, out, write, "shape.toml")
     with progress(quiet=as_json) as show:

@@ -33,13 +33,19 @@ def print_verdict(what: str, verdict: Verdict, advice: Iterable[str]) -> None:
         err.print(f"{what}: {remedy}", soft_wrap=True)
 
 
+def check_stated(out: Path | None, write: bool) -> None:
+    """Before anything is read: misuse exits with 2; raises `TakeError` where `out` cannot be."""
+    if write and out is not None:
+        raise typer.BadParameter("give --out or --write, not both", param_hint="--out")
+    if out is not None:
+        check_writable(out)
+
+
 def output_of(session: Path, out: Path | None, write: bool, name: str) -> Path:
     """Where a result goes: as stated, or called `name`, with --write beside the session file.
 
-    Misuse exits with 2; raises `TakeError` where nothing could be written.
+    Raises `TakeError` where nothing could be written.
     """
-    if write and out is not None:
-        raise typer.BadParameter("give --out or --write, not both", param_hint="--out")
     if write:
         check_writable(session)
     path = session.parent / name if write else out or Path(name)

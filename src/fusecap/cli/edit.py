@@ -34,11 +34,9 @@ def edit(
     ] = None,
     gaps_above: Annotated[
         float | None,
-        typer.Option(help="Take out frames whose bones have a wider mean error bar [deg]."),
+        typer.Option(help="Take out frames whose bones have a mean error bar of more degrees."),
     ] = None,
-    fill_gaps: Annotated[
-        float | None, typer.Option(help="Bridge gaps that last no longer than this [s].")
-    ] = None,
+    fill_gaps: Annotated[float | None, typer.Option(help="Bridge gaps of no more seconds.")] = None,
     butterworth: Annotated[
         float | None, typer.Option(help="Cut-off of a zero-lag fourth-order Butterworth [Hz].")
     ] = None,
