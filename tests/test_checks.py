@@ -2,6 +2,7 @@
 
 import json
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,11 +12,14 @@ from fusecap.body.landmarks import landmark_set_named
 from fusecap.body.pose import forward_kinematics, landmarks_in_world
 from fusecap.body.shape import BodyShape
 from fusecap.body.skeleton import PAPER21
+from fusecap.checks.people import _check_stature
 from fusecap.cli import app
 from fusecap.doctor import diagnose
 from fusecap.errors import CalibrationError, SessionError
+from fusecap.findings import Findings
 from fusecap.solve.body_measure import BodyMeasure
 from fusecap.sources.calibration_files import load_rig
+from fusecap.sources.session import Session
 from fusecap.sources.session_data import open_session
 from fusecap.sources.session_file import load_session
 from session_files import calibration_toml, edit, imu_csv, ring, write_session
@@ -196,3 +200,25 @@ def test_people_from_small_children_to_giants_are_measured(height_m):
         measure.add(points)
     assert measure.shape().height_m == pytest.approx(height_m, rel=0.01)
     assert np.allclose(measure.shape().offsets_m, shape.offsets_m, atol=0.02 * height_m)
+
+
+def test_a_child_beside_an_adult_is_no_scale():
+    landmarks = landmark_set_named("body25")
+    rng = np.random.default_rng(0)
+    shape = BodyShape.from_height(PAPER21, 1.0)
+    posed = forward_kinematics(shape, np.zeros((1, PAPER21.pose_size)))
+    bones, offsets_m = landmarks.bones(PAPER21), landmarks.offsets_m(shape)
+    rest = landmarks_in_world(*posed, bones, offsets_m)[0]
+    heights_m = np.repeat([1.8, 1.2], [60, 60])
+    people = heights_m[:, None, None] * rest + 0.015 * rng.standard_normal((120, 25, 3))
+    session = Session.model_validate(
+        {
+            "session": {"name": "two"},
+            "camera": [{"name": "c", "keypoints": "k"}],
+            "subject": [{"name": "a", "height_m": 1.8}, {"name": "b", "height_m": 1.2}],
+        },
+        context={"file": Path("session.toml")},
+    )
+    findings = Findings()
+    _check_stature(session, people, landmarks, findings)
+    assert not findings.sorted()

@@ -157,6 +157,20 @@ def test_locked_feet_stand_and_legs_keep_their_lengths(strength):
     assert out.provenance["edits"][0]["stances"] == 2
 
 
+def test_feet_are_locked_on_the_floor_that_a_shift_brings_them_to():
+    raised = edited(sliding_take(), floor_shift_m=0.3)
+    assert edited(raised, foot_lock=1.0).provenance["edits"][-1]["stances"] == 0
+    both = edited(raised, foot_lock=1.0, floor_shift_m=-0.3)
+    assert both.provenance["edits"][-1]["stances"] == 2
+
+
+def test_a_bar_that_every_frame_is_above_is_refused():
+    take = two_walkers(60)
+    take = take.with_theta(take.theta, bone_sigma_deg=np.full(take.bone_sigma_deg.shape, 5.0))
+    with pytest.raises(InputError, match=r"every frame; the least mean error bar is 5\.0 deg"):
+        edited(take, gaps_above_deg=4.0)
+
+
 def test_a_walk_s_feet_slide_less_and_nothing_jumps():
     shape = person()
     theta = walk(shape, 240)[None]
@@ -210,6 +224,13 @@ def test_the_command_tells_what_it_did_and_keeps_the_take(tmp_path):
     assert out.provenance["edits"][-1]["by_m"] == pytest.approx(-0.01)
     assert path.read_bytes() == before
     assert CliRunner().invoke(app, ["edit", str(path), "--trim", "1"]).exit_code == 2
+    edit = (tmp_path / "t-edited.npz").read_bytes()
+    again = CliRunner().invoke(app, ["edit", str(path), "--only", "ben"])
+    assert isinstance(again.exception, InputError) and "an earlier edit" in str(again.exception)
+    assert (tmp_path / "t-edited.npz").read_bytes() == edit
+    further = ["edit", str(tmp_path / "t-edited.npz"), "--floor-shift", "1cm", "--json"]
+    told = json.loads(CliRunner().invoke(app, further).output)["edits"]
+    assert [entry["edit"] for entry in told] == ["floor shift"], "only what was done now"
     same = CliRunner().invoke(app, [*command[:4], "--out", str(path)])
     assert isinstance(same.exception, InputError) and "name another file" in str(same.exception)
     assert path.read_bytes() == before

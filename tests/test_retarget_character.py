@@ -261,7 +261,7 @@ def test_the_command_shows_the_bones_it_matched(tmp_path):
     assert result.exit_code == 0, result.output
     told = json.loads(result.output)
     assert told["bones"]["left_shank"] == "mixamorig:LeftLeg"
-    assert [Path(file).name for file in told["files"]] == ["t_avatar.glb"]
+    assert [Path(file).name for file in told["files"]] == ["t_anna_avatar.glb"]
     assert "mixamorig:LeftLeg" in CliRunner().invoke(app, command).output
 
 

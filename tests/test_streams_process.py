@@ -152,3 +152,16 @@ def test_process_that_is_closed_while_it_is_gone_ends_at_once(receiver):
     streams.close()
     assert time.monotonic() - started_s < 3.0
     assert not any(thread.is_alive() for thread in streams._threads)
+
+
+def test_a_system_without_room_for_the_process_is_told_as_a_stream_that_cannot_be_opened(
+    monkeypatch,
+):
+    def refuse(*_, **__):
+        raise OSError(12, "Cannot allocate memory")
+
+    monkeypatch.setattr("fusecap.streams.process.subprocess.Popen", refuse)
+    with pytest.raises(InputError, match="cannot be started: Cannot allocate memory"):
+        StreamProcess(
+            [], {"anna": SHAPE}, 60.0, SessionClock().now_ns, LatencyBook().sent, lambda _: None
+        )

@@ -24,6 +24,8 @@ STATURES_M = (0.55, 2.45)
 STATED_TOLERANCE = 0.15
 """Limbs of equally tall people differ by less; a calibration that is 1.2 or 0.8 times too large
 differs by more."""
+NEAR_SHARE = 0.3
+"""Of people as tall as stated: with so many a scale is right, and others are somebody else."""
 TILTED = np.cos(np.radians(45))
 LEAST_PEOPLE = 5
 LEAST_FACES = 20
@@ -107,7 +109,8 @@ def _check_stature(
     elif stated and len(stated) == len(session.subjects):
         nearest_m = min(stated, key=lambda m: abs(np.log(stature_m / m)))
         factor = stature_m / nearest_m
-        if abs(factor - 1) > STATED_TOLERANCE:
+        near = _share_near(people, landmarks, stated)
+        if abs(factor - 1) > STATED_TOLERANCE and near < NEAR_SHARE:
             findings.add(
                 "warning",
                 "calibration",
@@ -118,7 +121,15 @@ def _check_stature(
             )
 
 
-def _stature_m(people: np.ndarray, landmarks: LandmarkSet) -> float:
+def _share_near(people: np.ndarray, landmarks: LandmarkSet, stated: list[float]) -> float:
+    """Of people at an instant, how many are about as tall as somebody is stated to be."""
+    each_m = np.array([_stature_m(one[None], landmarks, least=1) for one in people])
+    each_m = each_m[np.isfinite(each_m), None]
+    off = np.abs(each_m / np.array(stated) - 1.0).min(axis=1)
+    return float((off <= STATED_TOLERANCE).mean()) if len(off) else 0.0
+
+
+def _stature_m(people: np.ndarray, landmarks: LandmarkSet, least: int = LEAST_PEOPLE) -> float:
     """Median over limbs of the stature that they have in the reference proportions."""
     unit = _unit_lengths()
     found = []
@@ -130,7 +141,7 @@ def _stature_m(people: np.ndarray, landmarks: LandmarkSet) -> float:
                 lengths.append(np.linalg.norm(people[:, a] - people[:, b], axis=1))
         known = np.concatenate(lengths) if lengths else np.empty(0)
         known = known[np.isfinite(known)]
-        if len(known) >= LEAST_PEOPLE:
+        if len(known) >= least:
             found.append(float(np.median(known)) / unit[limb])
     return float(np.median(found)) if found else float("nan")
 

@@ -40,11 +40,11 @@ def edit(
     butterworth: Annotated[
         float | None, typer.Option(help="Cut-off of a zero-lag fourth-order Butterworth [Hz].")
     ] = None,
-    foot_lock: Annotated[
-        float | None, typer.Option(help="0-1: how far standing feet go to where they stand.")
-    ] = None,
     floor_shift: Annotated[
         str | None, typer.Option(help="Raise everybody by a length, such as 2cm; =-2cm lowers.")
+    ] = None,
+    foot_lock: Annotated[
+        float | None, typer.Option(help="0-1: how far standing feet go to where they stand.")
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -63,6 +63,8 @@ def edit(
     if target.resolve() == take.resolve():
         raise InputError(f"--out {target} is the take that is edited: name another file")
     start_s, end_s = _span(trim)
+    if out is None and target.exists():
+        raise InputError(f"{target} exists: an earlier edit; delete it, or name another with --out")
     options = EditOptions(
         only=tuple(only or ()),
         rename=dict(named("--rename", text, "OLD=NEW") for text in rename or ()),
@@ -74,9 +76,10 @@ def edit(
         foot_lock=foot_lock,
         floor_shift_m=_signed_m(floor_shift),
     )
-    edited = edit_take(open_take(take), options)
+    original = open_take(take)
+    edited = edit_take(original, options)
     save_take(edited, target)
-    edits = list(edited.provenance["edits"])
+    edits = list(edited.provenance["edits"])[len(original.provenance.get("edits", ())) :]
     if as_json:
         print_json({"files": [str(target)], "edits": edits})
         return

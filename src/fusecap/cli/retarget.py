@@ -41,7 +41,8 @@ def retarget(
     from fusecap.batch.replay import open_take
     from fusecap.exports.characters.retarget import retarget as onto
 
-    stem = f"{take.stem}_{safe_name(character.stem)}"
+    whose = "" if subject is None else f"_{safe_name(subject)}"
+    stem = f"{take.stem}{whose}_{safe_name(character.stem)}"
     ending = ".fbx" if character.suffix.lower() == ".fbx" else ".glb"
     done = onto(
         open_take(take),

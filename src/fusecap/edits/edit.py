@@ -72,15 +72,15 @@ def edit_take(take: Take, options: EditOptions) -> Take:
                 "frames_too_short": frames,
             }
         )
-    if options.foot_lock is not None:
-        _check("foot lock", options.foot_lock, low=0.0, high=1.0)
-        take, stances = lock_feet(take, options.foot_lock)
-        done.append({"edit": "foot lock", "strength": options.foot_lock, "stances": stances})
     if options.floor_shift_m is not None:
         _check("floor shift", options.floor_shift_m, low=-10.0, high=10.0, unit="m")
         theta = take.theta + np.eye(1, take.theta.shape[2], 1)[0] * options.floor_shift_m
         take = take.with_theta(theta)
         done.append({"edit": "floor shift", "by_m": options.floor_shift_m})
+    if options.foot_lock is not None:
+        _check("foot lock", options.foot_lock, low=0.0, high=1.0)
+        take, stances = lock_feet(take, options.foot_lock)
+        done.append({"edit": "foot lock", "strength": options.foot_lock, "stances": stances})
     if not done:
         raise InputError("no edit was asked for: nothing would change")
     earlier = list(take.provenance.get("edits", ()))

@@ -7,6 +7,7 @@ from jaxtyping import Bool
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation, Slerp
 
+from fusecap.errors import InputError
 from fusecap.take import Take
 
 
@@ -15,6 +16,11 @@ def mark_gaps(take: Take, above_deg: float) -> tuple[Take, int]:
     mean_deg = np.where(take.tracked, np.nan_to_num(take.bone_sigma_deg).mean(axis=2), 0.0)
     worse = take.tracked & (mean_deg > above_deg)
     tracked = take.tracked & ~worse
+    if take.tracked.any() and not tracked.any():
+        raise InputError(
+            f"gaps above {above_deg:g} deg: that is every frame; the least mean error bar is "
+            f"{mean_deg[take.tracked].min():.1f} deg"
+        )
     return take.with_theta(
         np.where(tracked[:, :, None], take.theta, np.nan),
         tracked=tracked,

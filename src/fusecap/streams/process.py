@@ -54,12 +54,17 @@ class _Child:
         rate_hz: float,
         now_ns: Callable[[], int],
     ) -> None:
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "fusecap.streams.process"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            start_new_session=True,  # Ctrl-C and SIGHUP are for the parent, which then ends this
-        )
+        try:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "fusecap.streams.process"],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                start_new_session=True,  # Ctrl-C and SIGHUP are for the parent, which then ends it
+            )
+        except OSError as error:
+            raise InputError(
+                f"the process for streams cannot be started: {error.strerror or error}"
+            ) from error
         assert self._process.stdin is not None and self._process.stdout is not None
         self._to: IO[bytes] = self._process.stdin
         self._from: IO[bytes] = self._process.stdout
