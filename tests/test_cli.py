@@ -51,6 +51,21 @@ def test_help_shows_usage_and_an_example(command):
         assert "Example: fusecap" in result.stdout
 
 
+@pytest.mark.parametrize(
+    ("words", "offered"), [(["cal"], "calibrate"), (["solve", "--ex"], "--export")]
+)
+def test_a_shell_completes_commands_and_options(words, offered):
+    typed = {"COMP_WORDS": " ".join(["fusecap", *words]), "COMP_CWORD": str(len(words))}
+    shell = subprocess.run(
+        [Path(sys.executable).with_name("fusecap")],
+        env={"_FUSECAP_COMPLETE": "complete_bash", **typed},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert offered in shell.stdout.split()
+
+
 def test_demo_reports_errors_and_speed_and_writes_files(tmp_path):
     result = fusecap("demo", "--seconds", 3, "--out", tmp_path, "--json")
     assert result.returncode == 0, result.stderr

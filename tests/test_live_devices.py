@@ -598,7 +598,7 @@ def test_lsl_stream_is_read_by_its_labels_and_lost_when_it_ends(tmp_path):
 
 def test_lsl_without_its_library_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "pylsl", None)
-    with pytest.raises(InputError, match=r"pip install 'fusecap\[lsl\]'"):
+    with pytest.raises(InputError, match=r"extra 'lsl'.*pip install 'pylsl>="):
         LslImus(stream="a", sensors={}, clock=SessionClock())
 
 
@@ -639,7 +639,7 @@ def test_missing_harvesters_is_named_before_anything_starts(tmp_path, monkeypatc
     file = write_session(tmp_path)
     edit(file, 'keypoints = "keypoints/cam0"', 'live = "genicam:1"')
     monkeypatch.setitem(sys.modules, "harvesters.core", None)
-    with pytest.raises(InputError, match="pip install"):
+    with pytest.raises(InputError, match="pip install 'harvesters>="):
         device_sources(load_session(file), SessionClock())
     monkeypatch.setitem(sys.modules, "harvesters.core", types.ModuleType("core"))
     (source,) = device_sources(load_session(file), SessionClock())

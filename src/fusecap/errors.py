@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from importlib import metadata
 
 
 class FusecapError(Exception):
@@ -48,3 +49,13 @@ def nearest(name: str, known: Iterable[str]) -> str:
     if close:
         return f"; did you mean '{close[0]}'?"
     return f"; known: {', '.join(names)}" if names else ""
+
+
+def from_extra(extra: str) -> str:
+    """How to install what an extra brings, by its own names: no index has a fusecap to extend."""
+    brings = [
+        f"'{requirement.partition(';')[0].strip()}'"
+        for requirement in metadata.requires("fusecap") or ()
+        if requirement.replace("'", '"').endswith(f'extra == "{extra}"')
+    ]
+    return f"install fusecap's extra '{extra}', or what it brings: pip install {' '.join(brings)}"

@@ -48,7 +48,6 @@ app = typer.Typer(
     name="fusecap",
     epilog="Start with: fusecap demo",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )

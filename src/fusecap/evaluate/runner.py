@@ -29,7 +29,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from fusecap.errors import InputError
+from fusecap.errors import InputError, from_extra
 from fusecap.evaluate.code_version import versions_of
 from fusecap.files import written_whole
 from fusecap.inputs import CELL, read_json
@@ -244,7 +244,7 @@ def _on_ray(
         import ray
         from ray.exceptions import RayError
     except ImportError:
-        raise InputError("--ray needs Ray; install fusecap[cluster]") from None
+        raise InputError(f"--ray needs Ray; {from_extra('cluster')}") from None
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     local = {"num_cpus": workers, "include_dashboard": False} if address == "local" else {}
     try:

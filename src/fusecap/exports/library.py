@@ -7,15 +7,14 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from fusecap.errors import InputError
+from fusecap.errors import InputError, from_extra
 from fusecap.files import written_whole
 
 
 def missing(error: ImportError, *, extra: str) -> InputError:
     """What to say of an optional library that cannot be imported: the command that installs it."""
     return InputError(
-        f"this format needs a library that cannot be imported ({error}); "
-        f"install it with: pip install 'fusecap[{extra}]'"
+        f"this format needs a library that cannot be imported ({error}); {from_extra(extra)}"
     )
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from fusecap.detect.runtimes import onnxruntime, openvino
 from fusecap.detect.runtimes.network import Network
-from fusecap.errors import InputError, nearest
+from fusecap.errors import InputError, from_extra, nearest
 from fusecap.inputs import NETWORK, check_input
 
 RUNTIMES = ("auto", "onnxruntime", "openvino")
@@ -41,12 +41,10 @@ def runtime_for(path: Path | str, runtime: str = "auto") -> str:
         runtime = "openvino" if path.suffix == ".xml" or by_openvino else "onnxruntime"
     if runtime == "onnxruntime" and not onnxruntime.installed():
         raise InputError(
-            f"{path.name} needs ONNX Runtime, which is not installed; "
-            "run: pip install 'fusecap[detect]'"
+            f"{path.name} needs ONNX Runtime, which is not installed; {from_extra('detect')}"
         )
     if runtime == "openvino" and not openvino.installed():
         raise InputError(
-            f"{path.name} needs OpenVINO, which is not installed; "
-            "run: pip install 'fusecap[openvino]'"
+            f"{path.name} needs OpenVINO, which is not installed; {from_extra('openvino')}"
         )
     return runtime

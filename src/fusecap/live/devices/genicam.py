@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from fusecap.errors import InputError
+from fusecap.errors import InputError, from_extra
 from fusecap.live.devices.grabbers import Picture
 from fusecap.live.devices.source import SessionClock, SourceLost
 from fusecap.sources.live_address import GenICam
@@ -34,8 +34,7 @@ def open_genicam(address: GenICam, clock: SessionClock) -> Callable[[], GenICamG
         core = importlib.import_module("harvesters.core")
     except ImportError:
         raise InputError(
-            "live = 'genicam:...' needs the extra 'genicam'; install it with: "
-            "pip install 'fusecap[genicam]'"
+            f"live = 'genicam:...' needs harvesters; {from_extra('genicam')}"
         ) from None
     return lambda: GenICamGrabber(address, clock, core)
 

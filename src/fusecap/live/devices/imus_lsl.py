@@ -6,7 +6,7 @@ import threading
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from fusecap.errors import InputError
+from fusecap.errors import InputError, from_extra
 from fusecap.live.devices.sensor_feed import SensorFeed
 from fusecap.live.devices.source import Deliver, SessionClock, SourceCounts, SourceLost
 from fusecap.sources.imu_streams.lsl import MAX_CHANNELS, SensorChannels, sensor_channels
@@ -136,9 +136,7 @@ def _pylsl() -> Any:
     try:
         import pylsl
     except ImportError:
-        raise InputError(
-            "live = \"lsl:...\" needs the extra 'lsl'; install it with: pip install 'fusecap[lsl]'"
-        ) from None
+        raise InputError(f'live = "lsl:..." needs pylsl; {from_extra("lsl")}') from None
     except RuntimeError as error:
         raise InputError(f'live = "lsl:...": the LSL library cannot be loaded ({error})') from error
     return pylsl

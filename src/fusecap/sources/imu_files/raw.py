@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Slerp
 
-from fusecap.errors import InputError
+from fusecap.errors import InputError, from_extra
 from fusecap.geometry.quaternions import from_wxyz, to_wxyz
 from fusecap.sources.imu_files.table import ImuTable
 
@@ -37,8 +37,7 @@ def orientation_from_raw(
     except ImportError as error:
         raise InputError(
             f"{table.path}: has no orientation; to find it from gyroscope and accelerometer needs "
-            f"a library that cannot be imported ({error}); install it with: "
-            "pip install 'fusecap[raw]'"
+            f"a library that cannot be imported ({error}); {from_extra('raw')}"
         ) from None
     magnetic = table.has(field) and bool(np.isfinite(table.take(field)).all(axis=1).any())
     values = table.take([*gyro, *accel, *(field if magnetic else ())])

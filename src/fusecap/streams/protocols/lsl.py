@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from fusecap.body.skeleton import Skeleton
-from fusecap.errors import InputError
+from fusecap.errors import InputError, from_extra
 from fusecap.streams.person_pose import PersonPose, StreamFrame
 from fusecap.streams.stream import Cast, StreamProtocol
 from fusecap.streams.target import Target
@@ -157,9 +157,7 @@ def _pylsl() -> Any:
     try:
         import pylsl
     except ImportError:
-        raise InputError(
-            "--to lsl needs the extra 'lsl'; install it with: pip install 'fusecap[lsl]'"
-        ) from None
+        raise InputError(f"--to lsl needs pylsl; {from_extra('lsl')}") from None
     except RuntimeError as error:
         raise InputError(f"--to lsl: the LSL library cannot be loaded ({error})") from error
     return pylsl
