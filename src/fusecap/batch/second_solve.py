@@ -22,7 +22,7 @@ from fusecap.errors import InputError
 from fusecap.geometry.quaternions import to_wxyz
 from fusecap.progress import Progress
 from fusecap.recording.reader import RecordedEvent, Recording
-from fusecap.setup import setup_of
+from fusecap.setup import Setup, setup_of
 from fusecap.sources.session import Session, SubjectSettings
 from fusecap.sources.session_data import MAX_INSTANTS
 from fusecap.types import (
@@ -74,6 +74,21 @@ class RecordedInstants:
 
 def solve_recording(recording: Recording, progress: Progress | None = None) -> Solved:
     """Both passes over a recording; raises `InputError` where it holds no instant."""
+    setup, instants = recorded_inputs(recording, progress)
+    return solve_instants(
+        setup,
+        instants,
+        progress=progress,
+        session_sha256=recording.sha256(),
+        simulated=recorded_setup(recording).simulated,
+        notes=loss_notes(recording),
+    )
+
+
+def recorded_inputs(
+    recording: Recording, progress: Progress | None = None
+) -> tuple[Setup, RecordedInstants]:
+    """What a second solve works on; raises `InputError` where there is no instant."""
     setup = recorded_setup(recording)
     samples: list[Sample] = []
     ticks_ns: list[int] = []
@@ -87,18 +102,11 @@ def solve_recording(recording: Recording, progress: Progress | None = None) -> S
             case RecordedEvent(event=CameraSample() | ImuSample() as sample):
                 samples.append(sample)
     times_ns = _times_ns(recording, ticks_ns, setup.session.settings.rate_hz)
-    notes = loss_notes(recording)
     session = _with_people(setup.session, commands)
     if any(command.kind is CommandKind.TPOSE for command in commands):
         session = _with_mountings(session, _mountings(recording, progress))
-    return solve_instants(
-        setup_of(session, setup.rig, setup.landmarks),
-        RecordedInstants(session, len(setup.landmarks.landmark_names), samples, times_ns),
-        progress=progress,
-        session_sha256=recording.sha256(),
-        simulated=setup.simulated,
-        notes=notes,
-    )
+    instants = RecordedInstants(session, len(setup.landmarks.landmark_names), samples, times_ns)
+    return setup_of(session, setup.rig, setup.landmarks), instants
 
 
 def _times_ns(recording: Recording, ticks_ns: list[int], rate_hz: float) -> list[int]:

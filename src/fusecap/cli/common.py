@@ -20,7 +20,6 @@ from fusecap.files import plain
 if TYPE_CHECKING:
     from fusecap.batch.solve import Solved
     from fusecap.exports.take_format import ExportOptions
-    from fusecap.take import Take
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object for machines.")]
 Unit = Annotated[
@@ -90,18 +89,19 @@ def checked_exports(option: str, text: str, unit: str | None, rig: str) -> Expor
     return Exports(formats=names, unit=unit, rig=rig)
 
 
-def write_take(
-    take: Take, path: Path, exports: Exports, *, picture: bool, interrupted: bool = False
-) -> list[Path]:
+def write_take(solved: Solved, path: Path, exports: Exports, *, picture: bool) -> list[Path]:
     """The take, its exports and its picture; exports of a take that stood there are set aside.
 
-    The take's provenance lists its exports, so that the next solve knows them. What an
-    `interrupted` solve has goes beside `path`, by names of its own: a whole take stays.
+    The take's provenance holds the solve's report, and lists its exports, so that the next solve
+    knows them. What an interrupted solve has goes beside `path`, by names of its own: a whole take
+    stays.
     """
     from fusecap.exports.take_files import plan_files
     from fusecap.take import save_take
 
-    if interrupted:
+    told = solved.report.as_json()
+    take = replace(solved.take, provenance={**solved.take.provenance, "report": told})
+    if solved.report.interrupted:
         path = path.with_name(f"{path.stem}-interrupted{path.suffix}")
     planned = plan_files(
         take,

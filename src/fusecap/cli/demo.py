@@ -66,11 +66,10 @@ def demo(
         solved = solve_simulation(simulation, associate=associate, progress=show)
         live = live_takes(simulation, associate=associate, lag_s=LAG_S, progress=show)
     files = write_take(
-        solved.take,
+        solved,
         out / "demo.npz",
         Exports(formats=["bvh"]),
         picture=True,
-        interrupted=solved.report.interrupted,
     )
     score = score_take(solved.take, simulation.truth)
     newest, settled = (score_take(take, simulation.truth) for take in live)

@@ -102,11 +102,10 @@ def solve(
         _stop_without_poses(solved, _nobody(solved.report))
     seen = ExportOptions(cameras=data.rig, landmarks=data.landmarks)
     files = write_take(
-        solved.take,
+        solved,
         target,
         replace(exports, options=seen),
         picture=picture,
-        interrupted=solved.report.interrupted,
     )
     detection = {} if detected is None else {"detection": detected.as_json()}
     _print_solved(solved, files, detection, as_json)
@@ -145,11 +144,10 @@ def _solve_recording(
     setup = recorded_setup(recording)
     seen = ExportOptions(cameras=setup.rig, landmarks=setup.landmarks)
     files = write_take(
-        solved.take,
+        solved,
         target,
         replace(exports, options=seen),
         picture=picture,
-        interrupted=solved.report.interrupted,
     )
     _print_solved(solved, files, replay, quiet)
 
