@@ -24,7 +24,7 @@ from fusecap.exports.rigs import PRESETS
 from fusecap.exports.take_files import export, export_take
 from fusecap.exports.take_format import ExportOptions, TakeFormat
 from fusecap.take import load_take, read_provenance, save_take
-from motions import any_poses, person, take_of, walk
+from motions import any_poses, person, solved, take_of, walk
 
 CONNECTING = {f"{side}_{bone}" for side in ("left", "right") for bone in ("pelvis", "clavicle")}
 
@@ -278,7 +278,7 @@ def test_metres_and_centimetres_and_rigs_never_share_a_name(tmp_path):
 
 def solved_again(take, target, *formats):
     """The files of a solve that wrote this take."""
-    return write_take(take, target, Exports(formats=list(formats)), picture=False)
+    return write_take(solved(take), target, Exports(formats=list(formats)), picture=False)
 
 
 def names_in(folder):

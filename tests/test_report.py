@@ -14,7 +14,6 @@ from typer.testing import CliRunner
 
 from fusecap.batch.report_page import report_page
 from fusecap.batch.seen import look_back
-from fusecap.batch.solve import Solved, SolveReport
 from fusecap.batch.solved_inputs import inputs_beside, open_solved_inputs
 from fusecap.body.skeleton import EXTENDED23
 from fusecap.cli import app
@@ -23,7 +22,7 @@ from fusecap.errors import TakeError
 from fusecap.evaluate.demo_scene import demo_scene
 from fusecap.evaluate.simulated_session import write_session
 from fusecap.take import load_take, save_take
-from motions import person, take_of, walk
+from motions import person, solved, take_of, walk
 
 SECONDS = 1.0
 
@@ -122,25 +121,12 @@ def test_the_page_has_all_sections_and_reaches_for_nothing(scene, tmp_path):
 
 
 def test_a_solve_leaves_its_report_in_the_take(scene, tmp_path):
-    report = SolveReport(
-        instants=60,
-        duration_s=1.0,
-        cameras=1,
-        subjects={},
-        reprojection_px={"cam1": {"median": 5.0, "p90": float("nan"), "keypoints": 7}},
-        solve_ms_median=1.25,
-        solve_ms_p99=2.5,
-        solves=120,
-        statuses={"converged": 120},
-        elapsed_s=3.0,
-        interrupted=False,
-        notes=("a sensor slept",),
-    )
-    solved = Solved(take=load_take(scene / "demo.npz"), report=report)
-    (path,) = write_take(solved, tmp_path / "solved.npz", Exports(formats=[]), picture=False)
+    cameras = {"cam1": {"median": 5.0, "p90": float("nan"), "keypoints": 7}}
+    told = solved(load_take(scene / "demo.npz"), reprojection_px=cameras, notes=("a sensor slept",))
+    (path,) = write_take(told, tmp_path / "solved.npz", Exports(formats=[]), picture=False)
     page = page_of(load_take(path))
-    for told in ("As the solve told them", "converged 120", "1.25", "a sensor slept"):
-        assert told in page
+    for text in ("As the solve told them", "converged 120", "1.25", "a sensor slept"):
+        assert text in page
 
 
 def test_without_its_session_the_page_says_what_is_missing(scene, tmp_path):
