@@ -48,7 +48,8 @@ from fusecap.live.run import LiveOptions, LiveRun
 from fusecap.live.status import LiveStatus
 from fusecap.setup import session_setup
 from fusecap.sources.session_file import load_session
-from fusecap.take import Take, load_take
+from fusecap.stored_take import load_take
+from fusecap.take import Take
 from fusecap.types import CameraImage, Event
 
 RATE_HZ = 60

@@ -35,7 +35,8 @@ from fusecap.sources.offset_files import offsets_toml, read_offsets
 from fusecap.sources.session_file import parse_session
 from fusecap.sources.sync_files import Clock, Clocks, read_sync, sync_toml
 from fusecap.sources.video import Video
-from fusecap.take import load_take, save_take
+from fusecap.stored_take import load_take
+from fusecap.take import save_take
 from motions import person, take_of, walk
 from recorded_run import record, simulated_run
 from session_files import ring, write_session

@@ -19,7 +19,8 @@ from fusecap.evaluate.simulated_session import write_session
 from fusecap.evaluate.simulated_solve import solve_simulation
 from fusecap.sources.session_data import open_session, unplaced_wearers
 from fusecap.sources.session_file import load_session
-from fusecap.take import load_take, take_from_theta
+from fusecap.stored_take import load_take
+from fusecap.take import take_from_theta
 
 SECONDS = 1.0
 

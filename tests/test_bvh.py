@@ -23,7 +23,8 @@ from fusecap.exports.formats.bvh import _ORDERS, write_bvh
 from fusecap.exports.rigs import PRESETS
 from fusecap.exports.take_files import export, export_take
 from fusecap.exports.take_format import ExportOptions, TakeFormat
-from fusecap.take import load_take, read_provenance, save_take
+from fusecap.stored_take import load_take, read_provenance
+from fusecap.take import save_take
 from motions import any_poses, person, solved, take_of, walk
 
 CONNECTING = {f"{side}_{bone}" for side in ("left", "right") for bone in ("pelvis", "clavicle")}

@@ -12,7 +12,7 @@ import pytest
 
 from fusecap.evaluate.demo_scene import demo_scene
 from fusecap.evaluate.simulated_session import write_session
-from fusecap.take import load_take
+from fusecap.stored_take import load_take
 
 
 def fusecap(*arguments: object, **options) -> subprocess.CompletedProcess[str]:

@@ -15,7 +15,8 @@ from fusecap.edits.edit import EditOptions, edit_take
 from fusecap.edits.gaps import gaps
 from fusecap.errors import InputError, TakeError
 from fusecap.feet import standing
-from fusecap.take import load_take, save_take
+from fusecap.stored_take import load_take
+from fusecap.take import save_take
 from motions import person, take_of, walk
 
 

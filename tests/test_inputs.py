@@ -39,7 +39,7 @@ from fusecap.sources.offset_files import read_offsets
 from fusecap.sources.session_file import load_session
 from fusecap.sources.sync_files import read_sync
 from fusecap.sources.video import Video
-from fusecap.take import load_take
+from fusecap.stored_take import load_take
 
 PACKAGE = Path(fusecap.__file__).parent
 

@@ -22,7 +22,7 @@ from fusecap.live.devices.playback_sources import PlaybackOptions, playback_sour
 from fusecap.live.devices.source import SessionClock, Source, SourceLost
 from fusecap.setup import session_setup
 from fusecap.sources.session_file import load_session
-from fusecap.take import load_take
+from fusecap.stored_take import load_take
 from fusecap.types import Event, Tick
 
 SECONDS = 120.0

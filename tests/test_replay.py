@@ -24,7 +24,7 @@ from fusecap.setup import SessionSetup
 from fusecap.sources.session import Session
 from fusecap.sources.session_data import open_session
 from fusecap.sources.session_file import load_session
-from fusecap.take import load_take
+from fusecap.stored_take import load_take
 from fusecap.types import Command, CommandKind, ImuSample, Tick
 from live_events import same_bits
 from recorded_run import record, simulated_run

@@ -13,7 +13,8 @@ import pytest
 from fusecap.evaluate.twin import twin_sequences
 from fusecap.sources.session_data import open_session
 from fusecap.sources.session_file import load_session
-from fusecap.take import load_take, save_take, take_from_theta
+from fusecap.stored_take import load_take
+from fusecap.take import save_take, take_from_theta
 from motion_texts import amc_text, asf_text
 
 

@@ -29,7 +29,7 @@ from fusecap.evaluate.simulator import (
 )
 from fusecap.sources.session_data import open_session
 from fusecap.sources.session_file import load_session
-from fusecap.take import load_take
+from fusecap.stored_take import load_take
 from motions import person, walk
 
 BODY25 = landmark_set_named("body25")

@@ -1,5 +1,7 @@
 import errno
 import json
+import os
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +11,8 @@ from fusecap.body.pose import forward_kinematics
 from fusecap.body.skeleton import EXTENDED23, PAPER21
 from fusecap.errors import TakeError
 from fusecap.files import written_whole
-from fusecap.take import Take, TakeBuilder, load_take, provenance, save_take
+from fusecap.stored_take import StoredTake, load_take
+from fusecap.take import MOTION, Take, TakeBuilder, provenance, save_take
 from fusecap.types import Estimate, Status
 from motions import any_poses, person, take_of, walk
 
@@ -169,7 +172,7 @@ def test_two_estimates_of_one_subject_at_once_are_refused():
         (lambda t: {"subject_names": ("anna", "anna")}, "share a name"),
         (lambda t: {"timestamps_ns": t.timestamps_ns[::-1]}, "do not increase"),
         (lambda t: {"rate_hz": 0.0}, "rate_hz"),
-        (lambda t: {"theta": t.theta * np.nan}, "'anna' is not a number up to 10000 in frame 0"),
+        (lambda t: {"theta": t.theta * np.nan}, "'anna' is not a number up to 10000 at 0 ns"),
         (lambda t: {"offsets_m": t.offsets_m * np.nan}, "no number up to"),
         (lambda t: {"offsets_m": t.offsets_m * 1e300}, "no number up to"),
         (lambda t: {"heights_m": -t.heights_m}, "metres above zero"),
@@ -282,3 +285,54 @@ def test_place_that_cannot_be_written_is_said_so(tmp_path, take):
 def test_unknown_subject_names_the_nearest(take):
     with pytest.raises(TakeError, match="did you mean 'anna'"):
         take.subject("ana")
+
+
+# In its file
+
+
+@pytest.mark.parametrize("packed", ["as saved", "deflated", "columns first"])
+def test_frames_in_the_file_are_those_of_the_whole(tmp_path, take, packed):
+    path = tmp_path / "take.npz"
+    take.tracked[1, 2] = False
+    save_take(take, path)
+    if packed != "as saved":
+        arrays = dict(np.load(path))
+        if packed == "columns first":
+            arrays |= {name: np.asfortranarray(arrays[name]) for name in MOTION}
+        (np.savez_compressed if packed == "deflated" else np.savez)(path, **arrays)
+    whole = load_take(path)
+    with StoredTake(path) as stored:
+        stored.check()
+        for part, expected in (
+            (stored.of_frames(1, 3), whole.of_frames(1, 3)),
+            (stored.at_frames([0, 2]), whole.at_frames([0, 2])),
+        ):
+            for name in ("timestamps_ns", "tracked", *MOTION):
+                np.testing.assert_array_equal(getattr(part, name), getattr(expected, name))
+        assert stored.subject_names == whole.subject_names and stored.skeleton == whole.skeleton
+        np.testing.assert_array_equal(stored.time_s, whole.time_s)
+
+
+def test_what_is_wrong_far_inside_is_found_without_reading_all_at_once(tmp_path):
+    take = take_of(np.zeros((1, 20_000, PAPER21.pose_size)), [person()], names=("anna",))
+    take.theta[0, 19_000, 5] = 1e9
+    path = tmp_path / "take.npz"
+    save_take(take, path)
+    tracemalloc.start()
+    try:
+        with StoredTake(path) as stored:
+            stored.of_frames(0, 10)
+            with pytest.raises(TakeError, match=r"take\.npz: theta of"):
+                stored.check()
+        assert tracemalloc.get_traced_memory()[1] < 0.5 * path.stat().st_size
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_take_that_is_cut_while_it_is_open_is_an_error(tmp_path, take):
+    path = tmp_path / "take.npz"
+    save_take(take, path)
+    with StoredTake(path) as stored:
+        os.truncate(path, 500)
+        with pytest.raises(TakeError, match="became shorter"):
+            stored.at_frames([0])

@@ -483,7 +483,9 @@ def canvas_of(shown) -> np.ndarray:
 @pytest.mark.slow
 def test_a_take_is_seen_and_scrubbing_moves_it(browser):
     take = take_of(np.stack([walk(person(), 120)]), [person()], names=(NASTY,))
-    curves = [BoneCurve(title="error (mm)", by_person={NASTY: np.ones((120, 21))})]
+    curves = [
+        BoneCurve(title="error (mm)", time_s=take.time_s, by_person={NASTY: np.ones((120, 21))})
+    ]
     with page_of() as page:
         shown_take = TakePage(page, take, rig=ring(3), curves=curves)
         with in_thread(shown_take.run):

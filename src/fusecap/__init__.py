@@ -43,8 +43,8 @@ if TYPE_CHECKING:
     from fusecap.sources.session import Session as Session
     from fusecap.sources.session_data import open_session as open_session
     from fusecap.sources.session_file import load_session as load_session
+    from fusecap.stored_take import load_take as load_take
     from fusecap.take import Take as Take
-    from fusecap.take import load_take as load_take
     from fusecap.take import save_take as save_take
     from fusecap.types import Detections as Detections
     from fusecap.types import Estimate as Estimate

@@ -15,10 +15,12 @@ import math
 import os
 import re
 import stat
+import struct
 import tomllib
 import zipfile
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,6 +35,8 @@ MOST_KEY_PARTS = 10_000_000
 """Dots in keys of a TOML file times those of its longest: 80 MB of its parser's memory."""
 MOST_ENTRIES = 1000
 """In a zip file."""
+_LOCAL_HEADER = struct.Struct("<26x2H")
+"""Before an entry of a zip file; how long its name and its remarks are, which follow."""
 
 _PART = r"""(?:[\w-]+|"(?:\\[^\n]|[^"\\\n])*"?|'[^'\n]*'?)"""
 _KEY_PART = re.compile(_PART)
@@ -184,23 +188,119 @@ def read_npz(path: Path | str, kind: InputKind, names: Iterable[str]) -> dict[st
 
     Other entries are not touched. What an array's header asks for must be in the file.
     """
-    with open_input(path, kind) as file:
+    with NpzFile(path, kind, names) as file:
+        return {name: file.array(name) for name in file.names}
+
+
+class NpzFile:
+    """Those of the named arrays that an .npz holds, open to be read whole or by rows.
+
+    Raises `kind.error`, here and in reading. Not to be shared by threads.
+    """
+
+    def __init__(self, path: Path | str, kind: InputKind, names: Iterable[str]) -> None:
+        self._path, self._kind = path, kind
+        self._file = open_input(path, kind)
         try:
-            with zipfile.ZipFile(file) as archive:
-                return _arrays(archive, kind, names)
+            with self._told():
+                self._archive = zipfile.ZipFile(self._file)
+                self._entries = _wanted(self._archive, kind, names)
+        except BaseException:
+            self._file.close()
+            raise
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """That were asked for and are there."""
+        return tuple(self._entries)
+
+    def array(self, name: str) -> np.ndarray:
+        """All of an array."""
+        with self._told():
+            return _array(self._archive, self._entries[name])
+
+    def rows(self, name: str) -> NpzRows:
+        """An array of two dimensions or more to be read by rows; its checksum is checked now."""
+        entry = self._entries[name]
+        with self._told():
+            shape, dtype, start, in_order = _layout(self._archive, entry)
+            if len(shape) < 2:
+                raise ValueError(f"{name} is {shape}, expected rows")
+            if entry.compress_type != zipfile.ZIP_STORED or not in_order:
+                return NpzRows(self, shape, dtype, held=_array(self._archive, entry))
+            with self._archive.open(entry) as member:
+                while member.read(_MB):
+                    pass
+            self._file.seek(entry.header_offset)
+            fields = _LOCAL_HEADER.unpack(self._file.read(_LOCAL_HEADER.size))
+            start += entry.header_offset + _LOCAL_HEADER.size + sum(fields)
+        return NpzRows(self, shape, dtype, start=start)
+
+    def bytes_at(self, offset: int, count: int) -> bytes:
+        """So many bytes of the file; raises where it has been cut since it was opened."""
+        with self._told():
+            self._file.seek(offset)
+            content = self._file.read(count)
+            if len(content) != count:
+                raise EOFError("it became shorter while it was read")
+        return content
+
+    def close(self) -> None:
+        """Nothing more is read."""
+        self._archive.close()
+        self._file.close()
+
+    def __enter__(self) -> NpzFile:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @contextmanager
+    def _told(self) -> Iterator[None]:
+        """Whatever reading raises becomes the kind's error."""
+        try:
+            yield
         except (zipfile.BadZipFile, zlib.error, EOFError) as error:
-            raise kind.error(
-                f"{path}: is damaged or cut short, or not {kind.what} ({_reason(error)})"
+            raise self._kind.error(
+                f"{self._path}: is damaged or cut short, or not {self._kind.what} "
+                f"({_reason(error)})"
             ) from None
         except Exception as error:  # the readers raise whatever garbage makes them stumble over
-            raise kind.error(
-                f"{path}: cannot be read ({_reason(error)}); expected {kind.what}"
+            raise self._kind.error(
+                f"{self._path}: cannot be read ({_reason(error)}); expected {self._kind.what}"
             ) from None
 
 
-def _arrays(
+class NpzRows:
+    """An array of an open .npz; from the disk, or held where it is packed."""
+
+    def __init__(
+        self,
+        file: NpzFile,
+        shape: tuple[int, ...],
+        dtype: np.dtype[Any],
+        *,
+        start: int = 0,
+        held: np.ndarray | None = None,
+    ) -> None:
+        self.shape, self.dtype = shape, dtype
+        self._file, self._start, self._held = file, start, held
+
+    def read(self, row: int, first: int, end: int) -> np.ndarray:
+        """`array[row, first:end]`, of numbers within its shape."""
+        if self._held is not None:
+            return self._held[row, first:end]
+        item = math.prod(self.shape[2:])
+        offset = (row * self.shape[1] + first) * item * self.dtype.itemsize
+        count = (end - first) * item * self.dtype.itemsize
+        content = self._file.bytes_at(self._start + offset, count)
+        return np.frombuffer(content, self.dtype).reshape(end - first, *self.shape[2:])
+
+
+def _wanted(
     archive: zipfile.ZipFile, kind: InputKind, names: Iterable[str]
-) -> dict[str, np.ndarray]:
+) -> dict[str, zipfile.ZipInfo]:
     entries = archive.infolist()
     if len(entries) > MOST_ENTRIES:
         raise ValueError(f"{len(entries)} entries, at most {MOST_ENTRIES} are read")
@@ -209,10 +309,19 @@ def _arrays(
     unpacked = sum(entry.file_size for entry in wanted.values())
     if kind.most_bytes is not None and unpacked > kind.most_bytes:
         raise ValueError(f"unpacks to {unpacked} bytes, at most {kind.most_bytes} are read")
-    return {name: _array(archive, entry) for name, entry in wanted.items()}
+    return wanted
 
 
 def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:
+    _layout(archive, entry)
+    with archive.open(entry) as member:
+        return np.lib.format.read_array(member, allow_pickle=False)
+
+
+def _layout(
+    archive: zipfile.ZipFile, entry: zipfile.ZipInfo
+) -> tuple[tuple[int, ...], np.dtype[Any], int, bool]:
+    """Shape, type, bytes before the first number, and whether the last index runs fastest."""
     name = entry.filename
     if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise ValueError(f"{name} is packed in an unknown way")
@@ -224,13 +333,12 @@ def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:
         }.get((major, minor))
         if header is None:
             raise ValueError(f"{name} is an array of version {major}.{minor}")
-        shape, _, dtype = header(member)
+        shape, fortran, dtype = header(member)
         if dtype.kind not in "biufSU":
             raise ValueError(f"{name} holds {dtype}, expected numbers or text")
         if dtype.itemsize == 0 or math.prod(shape) * dtype.itemsize > entry.file_size:
             raise ValueError(f"{name} states {shape} of {dtype}, more than the file holds")
-    with archive.open(entry) as member:
-        return np.lib.format.read_array(member, allow_pickle=False)
+        return shape, dtype, member.tell(), not fortran
 
 
 def _bounded(path: Path | str, kind: InputKind, value: Any) -> Any:

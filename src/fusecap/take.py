@@ -26,18 +26,18 @@ from fusecap.body.skeleton import Skeleton
 from fusecap.errors import TakeError, nearest
 from fusecap.files import written_whole
 from fusecap.geometry.quaternions import from_wxyz, to_wxyz
-from fusecap.inputs import TAKE, read_npz
 from fusecap.types import Estimate, Status, quality_of
 
 FORMAT_VERSION = 2
-_FORMAT_NAME = "fusecap take "
-_FORMAT = f"{_FORMAT_NAME}{FORMAT_VERSION}"
-_ENTRIES = (
-    *("format", "timestamps_ns", "rate_hz", "subject_names", "skeleton", "bone_names", "parents"),
-    *("heights_m", "offsets_m", "theta", "bone_position_in_world_m"),
-    *("bone_rotation_in_world_wxyz", "tracked", "bone_sigma_deg", "position_sigma_m"),
-    "provenance",
+FORMAT_NAME = "fusecap take "
+FORMAT = f"{FORMAT_NAME}{FORMAT_VERSION}"
+MOTION = (
+    *("theta", "bone_position_in_world_m", "bone_rotation_in_world_wxyz"),
+    *("bone_sigma_deg", "position_sigma_m"),
 )
+"""The arrays of numbers per subject and frame."""
+_CHECKED_FRAMES = 2048
+"""At a time, so that a check takes no memory to speak of."""
 
 UNITS = {
     "timestamps_ns": "ns, one clock",
@@ -79,18 +79,7 @@ class Take:
 
     def __post_init__(self) -> None:
         s, t, b = len(self.subject_names), len(self.timestamps_ns), len(self.bone_names)
-        for name, shape in {
-            "timestamps_ns": (t,),
-            "parents": (b,),
-            "heights_m": (s,),
-            "offsets_m": (s, b, 3),
-            "theta": (s, t, 3 + 3 * b),
-            "bone_position_in_world_m": (s, t, b, 3),
-            "bone_rotation_in_world_wxyz": (s, t, b, 4),
-            "tracked": (s, t),
-            "bone_sigma_deg": (s, t, b),
-            "position_sigma_m": (s, t, b),
-        }.items():
+        for name, shape in array_shapes(s, t, b).items():
             found = np.shape(getattr(self, name))
             if found != shape:
                 raise TakeError(
@@ -106,22 +95,21 @@ class Take:
             raise TakeError(f"offsets_m hold a value that is no number up to {MAX_OFFSET_M:g} m")
         if not ((self.heights_m > 0) & (self.heights_m <= MAX_OFFSET_M)).all():
             raise TakeError(f"heights_m are {self.heights_m}, expected metres above zero")
-        for name in (
-            "theta",
-            "bone_position_in_world_m",
-            "bone_rotation_in_world_wxyz",
-            "bone_sigma_deg",
-            "position_sigma_m",
-        ):
-            values = getattr(self, name)
+        for first in range(0, t, _CHECKED_FRAMES):
+            self._check_frames(first, first + _CHECKED_FRAMES)
+
+    def _check_frames(self, first: int, end: int) -> None:
+        tracked = self.tracked[:, first:end]
+        for name in MOTION:
+            values = getattr(self, name)[:, first:end]
             sound = (np.abs(values) <= MAX_M).all(axis=tuple(range(2, values.ndim)))
-            if (self.tracked & ~sound).any():
-                subject, frame = np.argwhere(self.tracked & ~sound)[0]
+            if (tracked & ~sound).any():
+                subject, frame = np.argwhere(tracked & ~sound)[0]
                 raise TakeError(
-                    f"{name} of '{self.subject_names[subject]}' is not a number up to {MAX_M:g} in "
-                    f"frame {frame}, which is marked tracked"
+                    f"{name} of '{self.subject_names[subject]}' is not a number up to {MAX_M:g} at "
+                    f"{self.timestamps_ns[first + frame]} ns, which is marked tracked"
                 )
-        quaternion = self.bone_rotation_in_world_wxyz[self.tracked]
+        quaternion = self.bone_rotation_in_world_wxyz[:, first:end][tracked]
         if not (
             np.allclose(np.linalg.norm(quaternion, axis=-1), 1, atol=1e-6)
             and (quaternion[..., 0] >= 0).all()
@@ -157,35 +145,23 @@ class Take:
             subject_names=tuple(self.subject_names[row] for row in kept),
             **{
                 name: getattr(self, name)[kept]
-                for name in (
-                    "heights_m",
-                    "offsets_m",
-                    "theta",
-                    "bone_position_in_world_m",
-                    "bone_rotation_in_world_wxyz",
-                    "tracked",
-                    "bone_sigma_deg",
-                    "position_sigma_m",
-                )
+                for name in ("heights_m", "offsets_m", "tracked", *MOTION)
             },
         )
 
     def of_frames(self, first: int, end: int) -> Take:
         """The same take from frame `first` up to, and without, frame `end`."""
+        return self._at(slice(first, end))
+
+    def at_frames(self, frames: Sequence[int] | Int[np.ndarray, " n"]) -> Take:
+        """The same take in these frames alone, which rise."""
+        return self._at(np.asarray(frames, dtype=np.int64))
+
+    def _at(self, frames: slice | Int[np.ndarray, " n"]) -> Take:
         return replace(
             self,
-            timestamps_ns=self.timestamps_ns[first:end],
-            **{
-                name: getattr(self, name)[:, first:end]
-                for name in (
-                    "theta",
-                    "bone_position_in_world_m",
-                    "bone_rotation_in_world_wxyz",
-                    "tracked",
-                    "bone_sigma_deg",
-                    "position_sigma_m",
-                )
-            },
+            timestamps_ns=self.timestamps_ns[frames],
+            **{name: getattr(self, name)[:, frames] for name in ("tracked", *MOTION)},
         )
 
     def with_theta(
@@ -247,6 +223,23 @@ def provenance(
         "options": dict(options),
         "simulated": simulated,
         "units": UNITS,
+    }
+
+
+def array_shapes(subjects: int, frames: int, bones: int) -> dict[str, tuple[int, ...]]:
+    """What each array of a take measures."""
+    s, t, b = subjects, frames, bones
+    return {
+        "timestamps_ns": (t,),
+        "parents": (b,),
+        "heights_m": (s,),
+        "offsets_m": (s, b, 3),
+        "theta": (s, t, 3 + 3 * b),
+        "bone_position_in_world_m": (s, t, b, 3),
+        "bone_rotation_in_world_wxyz": (s, t, b, 4),
+        "tracked": (s, t),
+        "bone_sigma_deg": (s, t, b),
+        "position_sigma_m": (s, t, b),
     }
 
 
@@ -373,7 +366,7 @@ def save_take(take: Take, path: Path | str) -> None:
     bars as float16, right to 0.1 %.
     """
     arrays = {
-        "format": np.array(_FORMAT),
+        "format": np.array(FORMAT),
         "timestamps_ns": take.timestamps_ns,
         "rate_hz": np.array(take.rate_hz),
         "subject_names": np.array(take.subject_names, dtype=np.str_),
@@ -392,69 +385,6 @@ def save_take(take: Take, path: Path | str) -> None:
     }
     with written_whole(Path(path)) as file:
         np.savez(file, **arrays)
-
-
-def is_take(path: Path | str) -> bool:
-    """Whether a take of any version stands there."""
-    try:
-        return _stated_format(read_npz(path, TAKE, ("format",))).startswith(_FORMAT_NAME)
-    except TakeError:
-        return False
-
-
-def read_provenance(path: Path | str) -> dict[str, Any]:
-    """What a take says of its making, and none of its motion; raises `TakeError`."""
-    try:
-        found = json.loads(str(read_npz(path, TAKE, ("provenance",))["provenance"]))
-    except (KeyError, ValueError, RecursionError) as error:
-        raise TakeError(f"{path}: the take does not say what made it ({error})") from None
-    if not isinstance(found, dict):
-        raise TakeError(f"{path}: the take does not say what made it")
-    return found
-
-
-def _stated_format(arrays: Mapping[str, np.ndarray]) -> str:
-    return str(arrays.get("format", ""))
-
-
-def load_take(path: Path | str) -> Take:
-    """Read a take; raises `TakeError` for a file that is missing, damaged or something else."""
-    path = Path(path)
-    arrays = read_npz(path, TAKE, _ENTRIES)
-    found = _stated_format(arrays)
-    if not found.startswith(_FORMAT_NAME):
-        raise TakeError(f"{path} is not a take: it has no 'format' entry of fusecap")
-    if found != _FORMAT:
-        raise TakeError(
-            f"{path} is a '{found}', this version reads '{_FORMAT}'; solve it again, or use the "
-            "version of fusecap that wrote it"
-        )
-    try:
-        return _take_from_arrays(arrays)
-    except KeyError as error:
-        raise TakeError(f"{path}: the take has no {error}") from None
-    except (TakeError, ValueError, TypeError) as error:
-        raise TakeError(f"{path}: {error}") from error
-
-
-def _take_from_arrays(arrays: Mapping[str, np.ndarray]) -> Take:
-    return Take(
-        timestamps_ns=arrays["timestamps_ns"].astype(np.int64),
-        rate_hz=float(arrays["rate_hz"]),
-        subject_names=tuple(arrays["subject_names"].tolist()),
-        skeleton_name=str(arrays["skeleton"]),
-        bone_names=tuple(arrays["bone_names"].tolist()),
-        parents=tuple(arrays["parents"].tolist()),
-        heights_m=arrays["heights_m"].astype(np.float64),
-        offsets_m=arrays["offsets_m"].astype(np.float64),
-        theta=arrays["theta"].astype(np.float64),
-        bone_position_in_world_m=arrays["bone_position_in_world_m"].astype(np.float64),
-        bone_rotation_in_world_wxyz=arrays["bone_rotation_in_world_wxyz"].astype(np.float64),
-        tracked=arrays["tracked"].astype(bool),
-        bone_sigma_deg=arrays["bone_sigma_deg"].astype(np.float64),
-        position_sigma_m=arrays["position_sigma_m"].astype(np.float64),
-        provenance=json.loads(str(arrays["provenance"])),
-    )
 
 
 def _wxyz_from_matrix(rotation: Float[np.ndarray, "t b 3 3"]) -> Float[np.ndarray, "t b 4"]:

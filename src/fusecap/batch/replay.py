@@ -22,7 +22,8 @@ from fusecap.recording.layout import SUFFIX, RecordedBody
 from fusecap.recording.reader import RecordedEvent, RecordedPose, Recording
 from fusecap.recording.setup_json import setup_from_values
 from fusecap.setup import SessionSetup
-from fusecap.take import Take, TakeBuilder, load_take, provenance, take_from_theta
+from fusecap.stored_take import load_take
+from fusecap.take import Take, TakeBuilder, provenance, take_from_theta
 from fusecap.types import Estimate
 
 

@@ -60,7 +60,7 @@ def imu(
     """
     from fusecap.calibrate.imus import session as calibration
     from fusecap.sources.session_file import load_session
-    from fusecap.take import load_take
+    from fusecap.stored_take import load_take
 
     check_choice("--from", source, ("motion", "tpose"))
     if source == "tpose" and (take is not None or optical or identify):

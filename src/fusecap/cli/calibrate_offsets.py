@@ -40,7 +40,7 @@ def offsets(
     from fusecap.sources.offset_files import offsets_toml
     from fusecap.sources.session_data import open_session
     from fusecap.sources.session_file import load_session
-    from fusecap.take import load_take
+    from fusecap.stored_take import load_take
 
     check_writable(out)
     take = load_take(truth) if truth else None

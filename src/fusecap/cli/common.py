@@ -139,7 +139,7 @@ def write_take(solved: Solved, path: Path, exports: Exports, *, picture: bool) -
 def _exports_of(path: Path) -> set[Path]:
     """What the take that stands there says was exported beside it."""
     from fusecap.files import safe_name
-    from fusecap.take import read_provenance
+    from fusecap.stored_take import read_provenance
 
     try:
         names = read_provenance(path).get("exports")

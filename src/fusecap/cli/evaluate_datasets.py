@@ -55,7 +55,7 @@ def session(
     from fusecap.evaluate.score import main_figures, score_take
     from fusecap.sources.session_data import open_session
     from fusecap.sources.session_file import load_session
-    from fusecap.take import load_take
+    from fusecap.stored_take import load_take
 
     loaded = load_session(session)
     known = load_take(truth or loaded.folder / "truth.npz")

@@ -51,9 +51,9 @@ def stream(
 
     Receivers, ports and axes are in docs/streams.md. Ctrl-C ends it.
     """
+    from fusecap.stored_take import load_take
     from fusecap.streams.play_take import TakePlayer, play
     from fusecap.streams.stream import open_stream
-    from fusecap.take import load_take
 
     targets = placed_targets(to, host)
     loaded = load_take(take)

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from fusecap.viewer.curves import BoneCurve
     from fusecap.viewer.page import Page
     from fusecap.viewer.recording import RecordedDetections
+    from fusecap.viewer.take import ViewedTake
 
 EXAMPLE = "Example: fusecap view demo/demo.npz --truth scene/truth.npz --session scene"
 
@@ -58,19 +59,18 @@ def view(
     Nothing leaves this machine. Ctrl-C ends it.
     """
     from fusecap.recording.layout import SUFFIX
-    from fusecap.sources.session_cameras import open_rig
-    from fusecap.sources.session_file import parse_session
-    from fusecap.take import load_take
+    from fusecap.stored_take import StoredTake
 
     detections = None
     if take.suffix == SUFFIX:
         loaded, detections = _recorded(take)
     else:
-        loaded = load_take(take)
-    rig = None if session is None else open_rig(parse_session(session))[0]
+        loaded = StoredTake(take)
+        loaded.check()
+    rig = None if session is None else _rig_of(session)
     if rig is None and detections is not None:
         rig = detections.setup.rig
-    curves = [] if truth is None else error_curves(loaded, load_take(truth))
+    curves = [] if truth is None else error_curves(loaded, StoredTake(truth))
     look(
         loaded,
         f"fusecap view {take.name}",
@@ -84,20 +84,38 @@ def view(
     )
 
 
-def error_curves(take: Take, truth: Take) -> list[BoneCurve]:
+def error_curves(take: ViewedTake, truth: ViewedTake) -> list[BoneCurve]:
     """Of positions and orientations; raises `TakeError` where the two have nothing in common."""
-    from fusecap.evaluate.errors_over_time import errors_over_time
-    from fusecap.viewer.curves import BoneCurve
+    import numpy as np
 
-    errors = errors_over_time(take, truth)
+    from fusecap.evaluate.errors_over_time import errors_over_time
+    from fusecap.evaluate.score import same_instants
+    from fusecap.viewer.curves import BoneCurve, drawn
+
+    shared, _ = same_instants(take.timestamps_ns, truth.timestamps_ns)
+    frames = np.union1d(drawn(shared), drawn(np.arange(len(take.timestamps_ns))))
+    seen = take.at_frames(frames)
+    _, true_frames = same_instants(seen.timestamps_ns, truth.timestamps_ns)
+    errors = errors_over_time(seen, truth.at_frames(np.unique(true_frames)))
+    time_s = take.time_s[frames]
     return [
-        BoneCurve(title="position error (mm)", by_person=errors.position_mm),
-        BoneCurve(title="orientation error (degrees)", by_person=errors.orientation_deg),
+        BoneCurve(title=title, time_s=time_s, by_person=values)
+        for title, values in (
+            ("position error (mm)", errors.position_mm),
+            ("orientation error (degrees)", errors.orientation_deg),
+        )
     ]
 
 
+def _rig_of(session: Path) -> Rig:
+    from fusecap.sources.session_cameras import open_rig
+    from fusecap.sources.session_file import parse_session
+
+    return open_rig(parse_session(session))[0]
+
+
 def look(
-    take: Take,
+    take: ViewedTake,
     title: str,
     *,
     rig: Rig | None,

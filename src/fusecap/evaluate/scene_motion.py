@@ -16,7 +16,7 @@ from fusecap.evaluate.simulator import at_times, placed
 from fusecap.inputs import MOTION, read_text
 from fusecap.motion.files import motion_formats
 from fusecap.motion.retarget import retarget
-from fusecap.take import load_take
+from fusecap.stored_take import load_take
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import viser
 import viser.uplot
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from fusecap.take import Take
 from fusecap.viewer.palette import Rgb, css
@@ -19,22 +19,30 @@ _POINTS = 400
 _HEIGHT_PX = 170
 
 
+def drawn(frames: Int[np.ndarray, " t"]) -> Int[np.ndarray, " n"]:
+    """Those of them that a curve is drawn of, evenly."""
+    return frames[np.unique(np.linspace(0, len(frames) - 1, min(_POINTS, len(frames))).astype(int))]
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BoneCurve:
-    """One value per bone and frame, for each person."""
+    """One value per bone and instant, for each person."""
 
     title: str
     """With its unit."""
-    by_person: Mapping[str, Float[np.ndarray, "t b"]]
+    time_s: Float[np.ndarray, " n"]
+    """As the take counts."""
+    by_person: Mapping[str, Float[np.ndarray, "n b"]]
     """NaN where there is none."""
     top: float | None = None
     """Of the axis; None: of the data."""
 
 
-def sigma_curve(take: Take) -> BoneCurve:
+def sigma_curve(take: Take, time_s: Float[np.ndarray, " n"]) -> BoneCurve:
     """How sure each bone's rotation is."""
     return BoneCurve(
         title="expected bone error (deg)",
+        time_s=time_s,
         by_person=dict(zip(take.subject_names, take.bone_sigma_deg, strict=True)),
     )
 
@@ -46,14 +54,12 @@ class Plot:
         self,
         gui: viser.GuiApi,
         curve: BoneCurve,
-        time_s: Float[np.ndarray, " t"],
         bone_names: Sequence[str],
         colours: Mapping[str, Rgb],
     ) -> None:
         self._curve = curve
         self._bone_names = list(bone_names)
-        self._rows = np.unique(np.linspace(0, len(time_s) - 1, _POINTS).astype(int))
-        self._time_s = time_s[self._rows]
+        self._time_s = curve.time_s
         self._drawn = self._data(ALL_BONES)
         self._now = -1
         self._handle = gui.add_uplot(
@@ -95,12 +101,12 @@ class Plot:
         lines = []
         for values in self._curve.by_person.values():
             if bone == ALL_BONES:
-                there = np.isfinite(values[self._rows])
-                total = np.where(there, values[self._rows], 0.0).sum(axis=1)
+                there = np.isfinite(values)
+                total = np.where(there, values, 0.0).sum(axis=1)
                 count = there.sum(axis=1)
                 lines.append(np.where(count > 0, total / np.maximum(count, 1), np.nan))
             else:
-                lines.append(values[self._rows, self._bone_names.index(bone)])
+                lines.append(values[:, self._bone_names.index(bone)])
         return lines
 
     def _top(self) -> float:

@@ -41,6 +41,10 @@ class RecordedDetections:
             return None
         return self._people[camera][row].astype(np.float64)
 
+    def views(self, gui: viser.GuiApi, colours: Mapping[str, Rgb]) -> RecordedViews:
+        """Adds them to a page."""
+        return RecordedViews(gui, self, colours)
+
     def _keep(self, sample: CameraSample) -> None:
         times_ns = self._times_ns[sample.camera]
         if not times_ns or sample.timestamp_ns - times_ns[-1] >= 1e9 / _KEPT_HZ:

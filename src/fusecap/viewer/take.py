@@ -4,22 +4,29 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Protocol
 
+import numpy as np
 import viser
+from jaxtyping import Bool, Float, Int
 from viser import GuiEvent
 
+from fusecap.body.shape import BodyShape
+from fusecap.body.skeleton import Skeleton
 from fusecap.errors import TakeError
 from fusecap.geometry.camera import Rig
 from fusecap.take import Take
 from fusecap.viewer.controls import PlaybackControls
-from fusecap.viewer.curves import ALL_BONES, BoneCurve, Plot, sigma_curve
+from fusecap.viewer.curves import ALL_BONES, BoneCurve, Plot, drawn, sigma_curve
 from fusecap.viewer.figure import Pose
 from fusecap.viewer.page import Page
 from fusecap.viewer.palette import css, escaped, person_rgb
 from fusecap.viewer.people import People
-from fusecap.viewer.recording import RecordedDetections, RecordedViews
 from fusecap.viewer.room import Room, add_view_controls, places_of
+
+if TYPE_CHECKING:
+    from fusecap.viewer.recording import RecordedDetections
 
 _UPDATES_HZ = 60.0
 _PLOTS_HZ = 8.0
@@ -28,13 +35,34 @@ _IDLE_S = 0.25
 _SMALL = "margin:2px 14px;font-size:0.85em"
 
 
+class ViewedTake(Protocol):
+    """What a page asks of a take: a `Take`, or one that stays in its file."""
+
+    @property
+    def timestamps_ns(self) -> Int[np.ndarray, " t"]: ...
+    @property
+    def time_s(self) -> Float[np.ndarray, " t"]: ...
+    @property
+    def tracked(self) -> Bool[np.ndarray, "s t"]: ...
+    @property
+    def subject_names(self) -> tuple[str, ...]: ...
+    @property
+    def heights_m(self) -> Float[np.ndarray, " s"]: ...
+    @property
+    def provenance(self) -> Mapping[str, Any]: ...
+    @property
+    def skeleton(self) -> Skeleton: ...
+    def shape(self, subject: int) -> BodyShape: ...
+    def at_frames(self, frames: Sequence[int] | Int[np.ndarray, " n"]) -> Take: ...
+
+
 class TakePage:
     """Shows a take until it is stopped; raises `TakeError` for one without a frame."""
 
     def __init__(
         self,
         page: Page,
-        take: Take,
+        take: ViewedTake,
         *,
         rig: Rig | None = None,
         curves: Sequence[BoneCurve] = (),
@@ -46,7 +74,8 @@ class TakePage:
         self._take = take
         rows = range(len(take.subject_names))
         self._shapes = [take.shape(row) for row in rows]
-        self._rotations = [take.bone_rotation_in_world(row) for row in rows]
+        frames = drawn(np.arange(len(take.timestamps_ns)))
+        seen = take.at_frames(frames)
         colours = {name: person_rgb(row) for row, name in enumerate(take.subject_names)}
         room = Room(page, rig)
         self._people = People(page.scene, take.skeleton, colours)
@@ -58,10 +87,10 @@ class TakePage:
             ]
             for box in self._boxes:
                 box.on_update(lambda _: self._controls.nudge())
-        everywhere = places_of(list(take.bone_position_in_world_m[:, :, 0]))
+        everywhere = places_of(list(seen.bone_position_in_world_m[:, :, 0]))
         add_view_controls(page, room, lambda: everywhere)
-        self._views = detections and RecordedViews(page.gui, detections, colours)
-        self._plots = self._add_plots([sigma_curve(take), *curves], colours)
+        self._views = detections and detections.views(page.gui, colours)
+        self._plots = self._add_plots([sigma_curve(seen, take.time_s[frames]), *curves], colours)
         self._drawn: tuple[int, tuple[bool, ...]] | None = None
         self._draw(0, 0.0, plots=True)
 
@@ -83,13 +112,16 @@ class TakePage:
 
     def _draw(self, frame: int, position_s: float, *, plots: bool) -> None:
         shown = tuple(box.value for box in self._boxes)
+        moved = (frame, shown) != self._drawn
+        poses = self._poses(frame) if moved or plots else {}
         with self._page.atomic():
-            if (frame, shown) != self._drawn:
+            if moved:
                 self._drawn = (frame, shown)
+                names = self._take.subject_names
                 self._people.show(
                     {
-                        name: self._pose(row, frame) if shown[row] else None
-                        for row, name in enumerate(self._take.subject_names)
+                        n: poses.get(n) if seen else None
+                        for n, seen in zip(names, shown, strict=True)
                     }
                 )
             self._controls.show(position_s)
@@ -97,30 +129,29 @@ class TakePage:
                 for plot in self._plots:
                     plot.mark(position_s)
                 if self._views is not None:
-                    self._views.show(int(self._take.timestamps_ns[frame]), self._poses(frame))
+                    self._views.show(int(self._take.timestamps_ns[frame]), poses)
 
     def _poses(self, frame: int) -> dict[str, Pose]:
-        poses = {n: self._pose(row, frame) for row, n in enumerate(self._take.subject_names)}
-        return {name: pose for name, pose in poses.items() if pose is not None}
-
-    def _pose(self, row: int, frame: int) -> Pose | None:
-        take = self._take
-        if not take.tracked[row, frame]:
-            return None
-        return Pose(
-            shape=self._shapes[row],
-            position_m=take.bone_position_in_world_m[row, frame],
-            rotation=self._rotations[row][frame],
-            quality=take.bone_quality[row, frame],
-        )
+        """Of who is tracked."""
+        take = self._take.at_frames([frame])
+        return {
+            name: Pose(
+                shape=self._shapes[row],
+                position_m=take.bone_position_in_world_m[row, 0],
+                rotation=take.bone_rotation_in_world(row)[0],
+                quality=take.bone_quality[row, 0],
+            )
+            for row, name in enumerate(take.subject_names)
+            if take.tracked[row, 0]
+        }
 
     def _add_plots(
         self, curves: Sequence[BoneCurve], colours: dict[str, tuple[int, int, int]]
     ) -> list[Plot]:
-        gui, take = self._page.gui, self._take
+        gui, bone_names = self._page.gui, self._take.skeleton.bone_names
         with gui.add_folder("Over time"):
-            bone = gui.add_dropdown("Bone", (ALL_BONES, *take.bone_names))
-            plots = [Plot(gui, curve, take.time_s, take.bone_names, colours) for curve in curves]
+            bone = gui.add_dropdown("Bone", (ALL_BONES, *bone_names))
+            plots = [Plot(gui, curve, bone_names, colours) for curve in curves]
 
         @bone.on_update
         def _(event: GuiEvent[viser.GuiDropdownHandle[str]]) -> None:
@@ -130,7 +161,7 @@ class TakePage:
         return plots
 
 
-def _legend(take: Take, colours: Sequence[tuple[int, int, int]]) -> str:
+def _legend(take: ViewedTake, colours: Sequence[tuple[int, int, int]]) -> str:
     lines = []
     for row, (name, colour) in enumerate(zip(take.subject_names, colours, strict=True)):
         dot = f'<span style="color:{css(colour)};font-size:1.3em">&#9679;</span>'

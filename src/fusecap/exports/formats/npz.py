@@ -18,7 +18,8 @@ from fusecap.errors import TakeError
 from fusecap.exports.rig_motion import rig_motions
 from fusecap.exports.take_format import ExportOptions, TakeFormat
 from fusecap.files import written_whole
-from fusecap.take import Take, is_take
+from fusecap.stored_take import is_take
+from fusecap.take import Take
 
 
 def write_npz(take: Take, path: Path, options: ExportOptions) -> None:
