@@ -3,8 +3,8 @@
     uv run --frozen python benchmarks/long_takes.py --minutes 30 [--folder FOLDER]
 
 The motion is made up (simulated). Prints seconds until `fusecap view` says where its page is, its
-processor seconds and peak memory (Linux), and what a frame costs that somebody scrubs to. Files stay
-in FOLDER where one is named, and are used again.
+processor seconds and peak memory (Linux), and what a frame costs that somebody scrubs to. Files
+stay in FOLDER where one is named, and are used again.
 """
 
 from __future__ import annotations

@@ -21,7 +21,8 @@ from fusecap.cli.common import Exports, write_take
 from fusecap.errors import TakeError
 from fusecap.evaluate.demo_scene import demo_scene
 from fusecap.evaluate.simulated_session import write_session
-from fusecap.take import load_take, save_take
+from fusecap.stored_take import load_take
+from fusecap.take import save_take
 from motions import person, solved, take_of, walk
 
 SECONDS = 1.0
