@@ -1,6 +1,6 @@
 """The solver on its own: one observation in, one pose out.
 
-    uv run python examples/solver_as_a_library.py
+    python examples/6_solver_as_a_library.py
 
 Feeds the first seconds of the simulated demo scene to an `Estimator`, one instant at a time, as an
 application with its own cameras and tracker would.

@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -33,6 +34,10 @@ from fusecap.inputs import VIDEO, check_input
 VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mts", ".mpg", ".mpeg")
 """What counts as a video in a folder."""
 
+_ANY_TEXT: dict[str, Any] = (
+    {"metadata_errors": "replace"} if int(av.__version__.partition(".")[0]) < 19 else {}
+)
+"""Titles in another encoding do not matter; PyAV 19, for Python 3.12 and newer, never minds."""
 _EARLIER = (0, 100, 1000)
 """Frames by which a seek aims before its goal, tried in turn; then from the start."""
 
@@ -75,8 +80,10 @@ class Video:
         self.path = Path(path)
         with _opened(self.path) as (container, stream):
             self._pts = _timestamps(container, stream)
-            claimed, rate = stream.frames, stream.average_rate or stream.guessed_rate
-            tick = Fraction(stream.time_base or 1)
+            claimed = stream.frames
+            rate = float(stream.average_rate or stream.guessed_rate or 0)
+            base = stream.time_base or 1  # since PyAV 19 no Fraction, but as rational
+            tick = Fraction(base.numerator, base.denominator)
             codec = stream.codec_context.name
             claimed_s = None if container.duration is None else container.duration / 1e6
         if len(self._pts) == 0:
@@ -221,7 +228,7 @@ def _opened(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
     if path.stat().st_size == 0:
         raise InputError(f"{path}: an empty file, expected a video; record or copy it again")
     try:
-        container = av.open(str(path), metadata_errors="replace")
+        container: InputContainer = av.open(str(path), **_ANY_TEXT)
     except (FFmpegError, OSError) as error:
         reason = error.strerror or str(error)
         raise InputError(
@@ -269,13 +276,16 @@ def _pictures(container: InputContainer, stream: VideoStream) -> Iterator[Decode
                 yield frame
 
 
-def _rate(times_ns: np.ndarray, stated: Fraction | None, tick_s: float) -> tuple[float, bool]:
-    """The rate [Hz], and whether it varies by more than the rounding of timestamps."""
+def _rate(times_ns: np.ndarray, stated: float, tick_s: float) -> tuple[float, bool]:
+    """The rate [Hz], and whether it varies by more than the rounding of timestamps.
+
+    `stated` is the file's own [Hz]; 0: it says nothing.
+    """
     if len(times_ns) < 2:
-        return float(stated or 30), False
+        return stated or 30.0, False
     times_s = times_ns * 1e-9
     mean_hz = (len(times_s) - 1) / float(times_s[-1])
-    for rate_hz in ([float(stated)] if stated else []) + [mean_hz]:
+    for rate_hz in ([stated] if stated else []) + [mean_hz]:
         rounding_s = min(1.5 * tick_s, 0.25 / rate_hz) + 1e-9
         if np.abs(times_s - np.arange(len(times_s)) / rate_hz).max() <= rounding_s:
             return rate_hz, False
