@@ -376,6 +376,7 @@ def test_a_foot_that_stands_is_told_from_one_that_is_lifted(worn):
     truth = marched(60)
     seen = observations(truth, sites=SITES if worn else ImuSites.none())
     window = filled(solver(sites=SITES if worn else ImuSites.none()), truth, seen)
+    window.stand(0, near=4)
     left = window._measured.contact[:60, 0]
     assert left[35:58].all()
     assert not left[8:24].any()

@@ -99,7 +99,7 @@ def believable_detections(given: Detections, cameras: int, landmarks: int) -> Be
     people = []
     for camera, some in enumerate(given.people):
         where = f"people of camera {camera}"
-        people.append(believable_keypoints(shaped_numbers(some, (-1, landmarks, 3), where)))
+        people.append(shaped_numbers(some, (-1, landmarks, 3), where))
         if len(some) > MOST_PEOPLE:
             raise InputError(f"{where}: {len(some)}; keep the {MOST_PEOPLE} surest")
     total = sum(map(len, people))
@@ -110,13 +110,32 @@ def believable_detections(given: Detections, cameras: int, landmarks: int) -> Be
         )
     return BelievableDetections(
         timestamp_ns=checked_moment(given.timestamp_ns, None),
-        people=tuple(people),
+        people=_believable_views(people),
         looked=given.looked,
     )
 
 
-def believable_reading(given: ImuReading, sensors: int) -> ImuReading:
+def _believable_views(
+    people: list[Float[np.ndarray, "_ k 3"]],
+) -> tuple[Float[np.ndarray, "_ k 3"], ...]:
+    if not people:
+        return ()
+    together = np.concatenate(people)
+    believed = believable_keypoints(together)
+    if believed is together:
+        return tuple(people)
+    return tuple(np.split(believed, np.cumsum([len(some) for some in people])[:-1]))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BelievableReading(ImuReading):
+    """What `believable_reading` returns: checked, so not checked again."""
+
+
+def believable_reading(given: ImuReading, sensors: int) -> BelievableReading:
     """What I sensors say; NaN for turns that are none and for impossible accelerations."""
+    if isinstance(given, BelievableReading) and len(given.bone_rotation_in_world) == sensors:
+        return given
     rotation = shaped_numbers(
         given.bone_rotation_in_world, (sensors, 3, 3), "orientations of sensors"
     )
@@ -125,11 +144,11 @@ def believable_reading(given: ImuReading, sensors: int) -> ImuReading:
     turns = np.where(sound[:, None, None], rotation, 0.0)
     square = np.swapaxes(turns, -1, -2) @ turns
     sound &= np.abs(square - np.eye(3)).max(axis=(1, 2), initial=0.0) < MAX_SHEAR
-    sound &= (np.cross(turns[:, :, 0], turns[:, :, 1]) * turns[:, :, 2]).sum(axis=1) > 0.0
+    sound &= np.linalg.det(turns) > 0.0
     felt = np.abs(accel).max(axis=1, initial=0.0) < MAX_ACCEL_M_S2
     if sound.all() and felt.all():
-        return ImuReading(bone_rotation_in_world=rotation, accel_in_world_m_s2=accel)
-    return ImuReading(
+        return BelievableReading(bone_rotation_in_world=rotation, accel_in_world_m_s2=accel)
+    return BelievableReading(
         bone_rotation_in_world=np.where(sound[:, None, None], rotation, np.nan),
         accel_in_world_m_s2=np.where(felt[:, None], accel, np.nan),
     )

@@ -223,8 +223,8 @@ class Pipeline:
         return self._estimators[name]
 
     def model(self, name: str) -> SubjectModel:
-        """What is known about a subject; nothing about one the session does not name."""
-        return self._models.get(name) or SubjectModel(name=name)
+        """As `Setup.model`."""
+        return self._setup.model(name)
 
     def expected(self, now_ns: int) -> list[Float[np.ndarray, "m k 3"]]:
         """Per camera the people expected at `now_ns`: x, y [px], confidence; NaN, NaN, 0 unknown.

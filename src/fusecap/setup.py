@@ -51,6 +51,11 @@ class Setup:
         if self.associate == "paper" and len(self.rig) == 1:
             raise SessionError('associate = "paper" triangulates; it needs two cameras or more')
 
+    def model(self, name: str) -> SubjectModel:
+        """What is known about a subject; nothing about one that is not named."""
+        known = (model for model in self.subjects if model.name == name)
+        return next(known, None) or SubjectModel(name=name)
+
 
 @dataclass(frozen=True, kw_only=True)
 class SessionSetup:

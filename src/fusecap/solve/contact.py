@@ -22,9 +22,8 @@ STILL_M_S2 = 1.5
 LOW_M, SLOW_M_S = 0.15, 0.35
 """Without a sensor: ankles and toes nearer to the floor, and slower."""
 SPAN = 4
-"""Instants over which that speed is taken: one would show more noise than speed."""
-
-
+"""Instants over which that speed is taken, half of them later where known: one would show more
+noise than speed."""
 ANCHORED = 100.0
 """How much a root that stays counts beside a foot that stands."""
 
@@ -37,39 +36,57 @@ class Contact:
     ) -> None:
         self._has_floor = has_floor
         worn = {bone: row for row, bone in enumerate(sites.bone)}
-        self._sensor = [
-            worn.get(bone, worn.get(int(parents[bone]), -1)) for bone in floor.bone.tolist()
-        ]
-        """Per floor joint the sensor on the foot it belongs to, or -1."""
+        feet = [worn.get(bone, worn.get(int(parents[bone]), -1)) for bone in floor.bone.tolist()]
+        self._worn = np.flatnonzero(np.array(feet) >= 0)
+        """Floor joints of feet that wear a sensor, and below it."""
+        self._sensor = np.array(feet, dtype=np.int64)[self._worn]
 
-    def at(
-        self, row: int, window: Window, feet_m: Float[np.ndarray, "n f 3"]
-    ) -> Float[np.ndarray, " r"]:
-        """Of the instant `row` of `window`: 0 or 1 per joint of `feet_m`, then of the root.
+    def between(
+        self, first: int, count: int, near: int, window: Window, feet_m: Float[np.ndarray, "n f 3"]
+    ) -> Float[np.ndarray, "m r"]:
+        """Of the instants from `first` of `count`: 0 or 1 per joint of `feet_m`, then of the root.
 
         `feet_m` are floor joints of instants solved alone: those of a motion would stand because
-        they were said to stand.
+        they were said to stand. Against their noise each is the mean of those `near` it, before and
+        after, as far as they are known.
         """
-        rests = np.zeros(len(self._sensor) + 1)
-        if row < 1:
-            return rests
-        first = max(row - SPAN, 0)
-        span_s = window.steps[first:row].sum()
-        speed = np.sqrt(((feet_m[row] - feet_m[first]) ** 2).sum(axis=1)) / span_s
-        stands = (speed < SLOW_M_S) & (feet_m[row, :, 1] < LOW_M) & (feet_m[row - 1, :, 1] < LOW_M)
-        told = bool((window.keypoints[row, :, :, 2] > 0.0).any())
-        for index, sensor in enumerate(self._sensor):
-            if sensor < 0 or not (window.present[row - 1, sensor] and window.present[row, sensor]):
-                continue
-            told = told or self._has_floor
-            felt = window.force[row, sensor]
-            before, now = window.rotation[row - 1, sensor], window.rotation[row, sensor]
+        if count < 2:
+            return np.zeros((count - first, feet_m.shape[1] + 1))
+        feet_m = _means(feet_m[:count], near)
+        rows = np.arange(first, count)
+        rests = np.zeros((len(rows), feet_m.shape[1] + 1))
+        before = np.maximum(rows - 1, 0)
+        start = np.maximum(rows - SPAN // 2, 0)
+        end = np.minimum(rows + SPAN // 2, count - 1)
+        elapsed_s = np.concatenate([[0.0], np.cumsum(window.steps[: count - 1])])
+        span_s = elapsed_s[end] - elapsed_s[start]
+        speed = np.linalg.norm(feet_m[end] - feet_m[start], axis=2) / span_s[:, None]
+        low = feet_m[:, :, 1] < LOW_M
+        stands = (speed < SLOW_M_S) & low[rows] & low[before]
+        told = (window.keypoints[rows, :, :, 2] > 0.0).any(axis=(1, 2))
+        if len(self._worn):
+            sensor = self._sensor
+            present = (window.present[rows] > 0.0) & (window.present[before] > 0.0)
+            here = present[:, sensor]
+            told |= self._has_floor & here.any(axis=1)
             # ‖R₁ - R₀‖ = 2 √2 sin(φ/2)
-            turned = np.sqrt(0.5 * ((now - before) ** 2).sum())
-            still = turned < STILL_RAD_S * window.steps[row - 1]
-            weight = np.sqrt(felt @ felt)
-            stands[index] = still and not abs(weight - GRAVITY_M_S2) > STILL_M_S2
+            change = window.rotation[rows][:, sensor] - window.rotation[before][:, sensor]
+            turned = np.sqrt(0.5 * (change**2).sum(axis=(2, 3)))
+            still = turned < STILL_RAD_S * (elapsed_s[rows] - elapsed_s[before])[:, None]
+            weight = np.linalg.norm(window.force[rows][:, sensor], axis=2)
+            # A force that is missing is no shock.
+            still &= ~(np.abs(weight - GRAVITY_M_S2) > STILL_M_S2)
+            stands[:, self._worn] = np.where(here, still, stands[:, self._worn])
         if self._has_floor:
-            rests[:-1] = stands
-        rests[-1] = 0.0 if told else ANCHORED
+            rests[:, :-1] = stands
+        rests[:, -1] = np.where(told, 0.0, ANCHORED)
+        rests[rows == 0] = 0.0
         return rests
+
+
+def _means(places_m: Float[np.ndarray, "n f 3"], near: int) -> Float[np.ndarray, "n f 3"]:
+    count = len(places_m)
+    rows = np.arange(count)
+    low, high = np.maximum(rows - near, 0), np.minimum(rows + near + 1, count)
+    sums = np.concatenate([np.zeros_like(places_m[:1]), np.cumsum(places_m, axis=0)])
+    return (sums[high] - sums[low]) / (high - low)[:, None, None]

@@ -58,6 +58,8 @@ _LOST_FACTOR = 2.0
 """Of the cost of an instant alone, or a poor one: beyond it a motion has gone astray."""
 _MAX_STEPS = 3
 """Of the window at a new instant; one or two are enough nearly always."""
+_NEAR = 2
+"""Instants before and after one, that tell noise of a foot from a step; more would be late."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,6 +119,10 @@ class Estimator:
         )
         self._coming: deque[tuple[Observation, np.ndarray]] = deque(maxlen=max(self._room, 1))
         """Instants `ahead` of the window, and their poses."""
+        self._before: deque[tuple[Observation, np.ndarray]] = deque(
+            maxlen=self.solver.options.window
+        )
+        """Seen last, while seeding; a motion begins with these."""
         self._recent: deque[Estimate] = deque(maxlen=self.solver.options.window)
         """Those of the instants in the window, as they were when new."""
         self._turn_shares = turn_shares(skeleton)
@@ -206,15 +212,19 @@ class Estimator:
         if solution is None:
             return None
         sound = solution.status is not Status.DIVERGED
+        seeding = self.solver.options.seeding
         if self._motion is not None and sound:
-            solution = self._in_window(self._motion, observation, data, solution)
+            if seeding and views.any():
+                self._motion.reset()
+                self._before.append((observation, solution.theta))
+            else:
+                while self._before:
+                    self._motion.push(*self._before.popleft())
+                solution = self._in_window(self._motion, observation, data, solution)
         solve_s = time.perf_counter() - started
         self._remember(observation, solution)
-        if self._motion is not None and self._motion.count > 2:
-            spread = self._motion.newest_spread()
-        else:
-            spread = self.solver.spread()
-        self._sigmas = sigmas(*spread, self._turn_shares)
+        if not seeding:
+            self._sigmas = sigmas(*self._spread(), self._turn_shares)
         self._views = views
         estimate = self._estimate(observation.timestamp_ns, solution, views, solve_s)
         self._measured_ns = observation.timestamp_ns
@@ -299,6 +309,7 @@ class Estimator:
         if not motion.goes_on(observation.timestamp_ns):
             self._begin_motion()
         motion.push(observation, alone.theta)
+        motion.stand(motion.count - 1 - _NEAR, _NEAR)
         motion.refine(_MAX_STEPS)
         theta = motion.pose()
         seen = np.count_nonzero(observation.keypoints[:, :, 2] > 0)
@@ -310,9 +321,15 @@ class Estimator:
         position, rotation = self.solver.posed(theta)
         return replace(alone, theta=theta, position_in_world_m=position, rotation_in_world=rotation)
 
+    def _spread(self) -> tuple[np.ndarray, np.ndarray]:
+        if self._motion is not None and self._motion.count > 2:
+            return self._motion.newest_spread()
+        return self.solver.spread()
+
     def _begin_motion(self) -> None:
         """Forget how the person moved so far."""
         self._recent.clear()
+        self._before.clear()
         self._coming.clear()
         if self._motion is not None:
             self._motion.reset()

@@ -98,6 +98,9 @@ class SolverOptions:
     initial_damping: float = 1e-2
     window: int = 8
     """Instants that a live pose is solved together with, itself among them; 1: each alone."""
+    seeding: bool = False
+    """Poses for a take to go on from: without error bars, and together only where no camera sees
+    somebody."""
     ahead: int = 0
     """Instants that a pose may be ahead of pictures, by sensors and as the motion goes on."""
     floor_radius_m: float = 0.05

@@ -25,6 +25,8 @@ _LATER = 2.0
 """What came later halves the variances that the normal equations give, but hardly the errors: they
 are like those before."""
 _MAX_STEPS, _TOLERANCE = 10, 1e-3
+NEAR = 4
+"""Instants before and after one, that tell noise of a foot from a step."""
 
 
 class Settled(NamedTuple):
@@ -41,6 +43,8 @@ class WholeMotion:
         """Motions that take turns may share a `workspace` for `PIECE + AHEAD` instants."""
         self._window = WindowSolver(solver, PIECE + AHEAD, workspace)
         self._turn_shares = turn_shares(solver.skeleton)
+        self._told = 0
+        """Instants that were asked which feet stand; what came now tells of the last of them."""
 
     def goes_on(self, timestamp_ns: int) -> bool:
         """Whether an instant follows without a gap; after one the motion must end."""
@@ -61,6 +65,7 @@ class WholeMotion:
         window = self._window
         if not count:
             return []
+        window.stand(self._told - 2 * NEAR, NEAR)
         if window.count > 2:
             window.refine(_MAX_STEPS, _TOLERANCE)
         spreads = (_LATER * spread for spread in window.spreads(count))
@@ -69,4 +74,5 @@ class WholeMotion:
             for row, (turn, place) in enumerate(zip(*spreads, strict=True))
         ]
         window.fold(count)
+        self._told = window.count
         return settled

@@ -19,7 +19,7 @@ from fusecap.kernels import band, groups, uncertainty, window
 from fusecap.kernels.jit import FINITE
 from fusecap.kernels.lie import wrap_pose
 from fusecap.solve.contact import Contact
-from fusecap.solve.pose_solver import UNKNOWN_RIDGE, PoseSolver
+from fusecap.solve.pose_solver import PoseSolver
 from fusecap.types import GRAVITY_M_S2, Observation
 
 LONGEST_STEP_S = 0.1
@@ -105,6 +105,8 @@ class WindowSolver:
         self._newest = np.zeros((p, p))
         """L of the newest instant, after the last step."""
         self._covariance = np.zeros((p, p))
+        self._eliminated = False
+        """Whether the workspace holds L of all instants at their poses."""
         self._prior: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
         """What those that left say of the two oldest: H (2, 3, P, P), g (2, P), both at (2, P)."""
 
@@ -134,7 +136,13 @@ class WindowSolver:
         row = self.count
         self._append(observation, theta)
         self._feet_m[row] = self._solver.posed(theta)[0][self._solver.model.floor.bone]
-        self._measured.contact[row] = self._contact.at(row, self._measured, self._feet_m)
+
+    def stand(self, first: int, near: int) -> None:
+        """Tell which feet stand at the instants from `first` on, by all that came until now."""
+        first = max(first, 0)
+        self._measured.contact[first : self.count] = self._contact.between(
+            first, self.count, near, self._measured, self._feet_m
+        )
 
     def _append(self, observation: Observation, theta: Float[np.ndarray, " p"]) -> None:
         row, measured = self.count, self._measured
@@ -157,21 +165,24 @@ class WindowSolver:
     def refine(self, max_iterations: int, tolerance: float | None = None) -> None:
         """Levenberg-Marquardt from where the poses are; never makes their cost worse.
 
-        Ends when a step lowers the cost by less than the share `tolerance`; without one, after the
-        first step that does nearly what the quadratic model promises: then the new instant's start
-        was near, and those before it were solved long ago.
+        Ends before a step that promises to lower the cost by less than the share `tolerance`;
+        without one, after the first that does nearly what the quadratic model promises: then the
+        new instant's start was near, and those before it were solved long ago.
         """
         workspace, n = self._workspace, self.count
         theta, trial, step = self._theta[:n], workspace.trial[:n], workspace.step[:n]
         hessian, gradient = workspace.hessian[:n], workspace.gradient[:n]
         cost = self._evaluate(theta)
-        damping = _DAMPING
+        damping = _DAMPING if tolerance is None else _LEAST_DAMPING
         for _ in range(max_iterations):
             if not cost < FINITE or damping > _MAX_DAMPING:
                 break
             positive = band.eliminate(hessian, gradient, n, damping, _RIDGE, workspace.square[0])
             self._newest[:] = hessian[n - 1, 0]
             promised = 0.5 * float(np.vdot(gradient, gradient))
+            if positive and tolerance is not None and promised <= tolerance * cost:
+                self._eliminated = True
+                break
             trial_cost = np.inf
             if positive:
                 band.step_of(hessian, gradient, step)
@@ -183,12 +194,8 @@ class WindowSolver:
                 continue
             decrease = cost - trial_cost
             theta[:] = trial
-            if tolerance is None:
-                done = abs(decrease - promised) < _KEPT_PROMISE * promised
-            else:
-                done = decrease <= tolerance * cost
             cost, damping = trial_cost, max(damping / 10.0, _LEAST_DAMPING)
-            if done:
+            if tolerance is None and abs(decrease - promised) < _KEPT_PROMISE * promised:
                 break
 
     def ahead(
@@ -250,12 +257,11 @@ class WindowSolver:
         return self._spread(self.count - 1)
 
     def spreads(self, count: int) -> tuple[Float[np.ndarray, "n b"], Float[np.ndarray, "n b"]]:
-        """The same of the oldest instants, by all that the window holds."""
+        """The same of the oldest instants, by all that the window holds, once it is refined."""
         workspace, square, n = self._workspace, self._workspace.square[0], self.count
         hessian, gradient = workspace.hessian[:n], workspace.gradient[:n]
         turn, place = np.full((2, n, self._solver.skeleton.bone_count), np.nan)
-        self._evaluate(self._theta[:n])
-        if band.eliminate(hessian, gradient, n, 0.0, UNKNOWN_RIDGE, square):
+        if self._eliminated or band.eliminate(hessian, gradient, n, 0.0, _RIDGE, square):
             for t in range(n - 1, -1, -1):
                 uncertainty.step_back(hessian, t, workspace.covariances, self._covariance, square)
                 turn[t], place[t] = self._spread(t)
@@ -287,6 +293,7 @@ class WindowSolver:
 
     def _evaluate(self, theta: Float[np.ndarray, "n p"], owned: int | None = None) -> float:
         """Cost, with normal equations in the workspace, of terms that touch the first `owned`."""
+        self._eliminated = False
         workspace, measured, n = self._workspace, self._measured, len(theta)
         hessian, gradient = workspace.hessian[:n], workspace.gradient[:n]
         cost = window.evaluate_window(
