@@ -82,7 +82,7 @@ def test_demo_reports_errors_and_speed_and_writes_files(tmp_path):
     assert 0 < report["solve_ms_median"] <= report["solve_ms_p99"]
     take = load_take(tmp_path / "demo.npz")
     assert take.tracked.all()
-    assert {path.suffix for path in tmp_path.iterdir()} == {".npz", ".bvh", ".png"}
+    assert {path.suffix for path in tmp_path.iterdir()} == {".npz", ".bvh", ".png", ".json"}
 
 
 def test_solve_writes_the_take_and_reports_in_json(session, tmp_path):

@@ -235,3 +235,9 @@ def test_the_command_tells_what_it_did_and_keeps_the_take(tmp_path):
     same = CliRunner().invoke(app, [*command[:4], "--out", str(path)])
     assert isinstance(same.exception, InputError) and "name another file" in str(same.exception)
     assert path.read_bytes() == before
+
+
+def test_a_name_that_is_given_two_new_ones_is_refused(tmp_path):
+    command = ["edit", str(tmp_path / "t.npz"), "--rename", "anna=a", "--rename", "anna=b"]
+    result = CliRunner().invoke(app, command)
+    assert result.exit_code == 2 and "'anna' is both 'a' and 'b'" in result.output

@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import struct
 import subprocess
 import sys
 import warnings
@@ -25,6 +26,7 @@ from fusecap.body.skeleton import EXTENDED23, PAPER21
 from fusecap.cli import app
 from fusecap.errors import InputError, TakeError
 from fusecap.evaluate.demo_scene import demo_scene
+from fusecap.exports.fbx_tree import FbxElement, FbxFile, array_property, text_property
 from fusecap.exports.formats import FORMATS, format_named
 from fusecap.exports.gltf import Gltf
 from fusecap.exports.gltf_people import add_body, add_joints
@@ -33,7 +35,7 @@ from fusecap.exports.opensim import OPENSIM_FROM_OURS
 from fusecap.exports.rest_rig import rest_rig
 from fusecap.exports.rig_motion import rig_motion
 from fusecap.exports.rigs import PRESETS
-from fusecap.exports.take_files import export_all, export_take
+from fusecap.exports.take_files import export_take, plan_files
 from fusecap.exports.take_format import ExportOptions
 from fusecap.feet import foot_events, standing
 from fusecap.geometry.camera import Rig
@@ -667,6 +669,25 @@ def test_several_formats_at_once_and_choices_that_none_has(tmp_path):
     assert names[:3] == ["t_anna.vrm.cm.bvh", "t_ben.vrm.cm.bvh", "t.csv"]
     assert names[3:] == ["t_anna.trc", "t_ben.trc"]
     with pytest.raises(InputError, match="csv has no rig"):
-        export_all(take, tmp_path, formats=["csv"], stem="u", rig="vrm")
+        plan_files(take, tmp_path, formats=["csv"], stem="u", rig="vrm")
     with pytest.raises(InputError, match="csv is written in m, not in cm"):
-        export_all(take, tmp_path, formats=["csv"], stem="u", unit="cm")
+        plan_files(take, tmp_path, formats=["csv"], stem="u", unit="cm")
+
+
+def test_fbx_is_read_as_it_was_written():
+    values = np.arange(5, dtype=np.int64)
+    inner = FbxElement(b"KeyTime", [array_property(values)])
+    model = FbxElement(
+        b"Model", [b"L" + struct.pack("<q", 7), text_property("Zoë\0\1Model".encode())], [inner]
+    )
+    file = FbxFile(7400, [FbxElement(b"Objects", [], [model]), FbxElement(b"Takes", [])], b"f" * 16)
+    data = b"".join(file.pieces())
+    again = FbxFile.read(data)
+    assert b"".join(again.pieces()) == data
+    found = again.named(b"Objects").child(b"Model")
+    assert found.whole(0) == 7 and found.text(1) == "Zoë\0\1Model".encode()
+    assert found.child(b"KeyTime").properties == [array_property(values)]
+    with pytest.raises(InputError, match=r"found version 7\.7"):
+        FbxFile.read(data[:23] + struct.pack("<I", 7700) + data[27:])
+    with pytest.raises(InputError, match="unknown type b'Q'"):
+        FbxFile.read(data.replace(b"L\x07\0", b"Q\x07\0"))

@@ -80,6 +80,7 @@ TAKE = InputKind(what="a take (.npz)", most_bytes=4096 * _MB, error=TakeError)
 PRIOR = InputKind(what="a pose prior (.npz)", most_bytes=64 * _MB)
 BOARD = InputKind(what="a board (board.toml)", most_bytes=4 * _MB, error=CalibrationError)
 MOTION = InputKind(what="a motion file", most_bytes=256 * _MB)
+MADE_FILES = InputKind(what="a list of files made from a take", most_bytes=4 * _MB)
 CHARACTER = InputKind(what="a character (.glb, .vrm)", most_bytes=1024 * _MB)
 NETWORK = InputKind(what="a network (.onnx or OpenVINO .xml)", most_bytes=2048 * _MB)
 DATASET = InputKind(what="a file of a data set", most_bytes=2048 * _MB)
@@ -96,6 +97,7 @@ KINDS = (
         TAKE,
         PRIOR,
         MOTION,
+        MADE_FILES,
         CHARACTER,
         NETWORK,
         DATASET,

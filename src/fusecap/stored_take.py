@@ -184,17 +184,6 @@ def is_take(path: Path | str) -> bool:
     return str(found.get("format", "")).startswith(FORMAT_NAME)
 
 
-def read_provenance(path: Path | str) -> dict[str, Any]:
-    """What a take says of its making, and none of its motion; raises `TakeError`."""
-    try:
-        found = json.loads(str(read_npz(path, TAKE, ("provenance",))["provenance"]))
-    except (KeyError, ValueError, RecursionError) as error:
-        raise TakeError(f"{path}: the take does not say what made it ({error})") from None
-    if not isinstance(found, dict):
-        raise TakeError(f"{path}: the take does not say what made it")
-    return found
-
-
 def _check_format(found: str) -> None:
     if not found.startswith(FORMAT_NAME):
         raise ValueError("is not a take: it has no 'format' entry of fusecap")

@@ -44,6 +44,7 @@ def angles(
     from fusecap.angles.joint_angles import joint_angles
     from fusecap.batch.replay import open_take
     from fusecap.exports import angle_files
+    from fusecap.exports.made_files import list_made
     from fusecap.files import distinct_names
 
     target = out or take.with_name(f"{take.stem}_angles.csv")
@@ -90,6 +91,7 @@ def angles(
                 plot_gait(sides, beside(row, "_gait.png"))
             else:
                 note(f"'{name}' has no gait cycle: no foot strikes twice, 0.5 to 2.5 s apart")
+    list_made(take, files)
     summary = {
         found.subject_names[row]: _summary(found.names, found.deg[row], found.sd_deg[row])
         for row in people

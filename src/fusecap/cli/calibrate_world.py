@@ -9,7 +9,7 @@ import typer
 
 from fusecap.calibrate.verdict import Verdict
 from fusecap.cli.calibrations import print_verdict
-from fusecap.cli.common import Json, check_choice, length_m, named, print_json
+from fusecap.cli.common import Json, check_choice, length_m, named, named_once, print_json
 from fusecap.cli.terminal import console, wrote
 
 if TYPE_CHECKING:
@@ -239,8 +239,7 @@ def _views(rig: Rig, board_file: Path, floor: list[Path]) -> tuple[dict[str, Boa
 
     board = read_board(board_file)
     views = {}
-    for text in floor:
-        name, path = named("--floor", str(text), "CAMERA=IMAGE")
+    for name, path in named_once("--floor", map(str, floor), "CAMERA=IMAGE").items():
         camera = rig[name]
         image = read_grey(path)
         if (image.shape[1], image.shape[0]) != camera.size_px:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from fusecap.cli.terminal import console, err, note, wrote
-from fusecap.errors import TakeError, nearest
+from fusecap.errors import nearest
 from fusecap.exports.formats import FORMATS
 from fusecap.exports.rigs import PRESETS
 from fusecap.files import plain
@@ -61,6 +61,19 @@ def named(option: str, text: str, expected: str) -> tuple[str, str]:
     return name, value
 
 
+def named_once(option: str, texts: Iterable[str] | None, expected: str) -> dict[str, str]:
+    """Values by names of a repeated NAME=VALUE; a name that comes twice is misuse."""
+    found: dict[str, str] = {}
+    for text in texts or ():
+        name, value = named(option, text, expected)
+        if name in found:
+            raise typer.BadParameter(
+                f"'{name}' is both '{found[name]}' and '{value}'", param_hint=option
+            )
+        found[name] = value
+    return found
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Exports:
     """What a command was asked to write beside a take."""
@@ -90,12 +103,13 @@ def checked_exports(option: str, text: str, unit: str | None, rig: str) -> Expor
 
 
 def write_take(solved: Solved, path: Path, exports: Exports, *, picture: bool) -> list[Path]:
-    """The take, its exports and its picture; exports of a take that stood there are set aside.
+    """The take, its exports and its picture; what was made of a take that stood there is set aside.
 
-    The take's provenance holds the solve's report, and lists its exports, so that the next solve
-    knows them. What an interrupted solve has goes beside `path`, by names of its own: a whole take
-    stays.
+    Only once the take is written: where that fails, all stays. The take's provenance holds the
+    solve's report. What an interrupted solve has goes beside `path`, by names of its own: a whole
+    take stays.
     """
+    from fusecap.exports.made_files import list_made
     from fusecap.exports.take_files import plan_files
     from fusecap.take import save_take
 
@@ -112,49 +126,31 @@ def write_take(solved: Solved, path: Path, exports: Exports, *, picture: bool) -
         rig=exports.rig,
         options=exports.options,
     )
-    earlier = _exports_of(path)
-    again = {file.path for file in planned}
-    _set_aside(earlier - again)
-    if planned:
-        names = [file.path.name for file in planned]
-        take = replace(take, provenance={**take.provenance, "exports": names})
     save_take(take, path)
     files = [path]
+    frames = len(take.timestamps_ns)
+    image = path.with_suffix(".png")
     try:
         for file in planned:
             file.write(take)
             files.append(file.path)
-    finally:
-        _set_aside((earlier & again).difference(files))
-    frames = len(take.timestamps_ns)
-    if picture and frames:
-        from fusecap.exports.plot import plot_take
+            list_made(path, files)
+        if picture and frames:
+            from fusecap.exports.plot import plot_take
 
-        image = path.with_suffix(".png")
-        plot_take(take, sorted({0, frames // 3, 2 * frames // 3, frames - 1}), image)
-        files.append(image)
+            plot_take(take, sorted({0, frames // 3, 2 * frames // 3, frames - 1}), image)
+            files.append(image)
+    finally:
+        set_aside_earlier(path, files)
     return files
 
 
-def _exports_of(path: Path) -> set[Path]:
-    """What the take that stands there says was exported beside it."""
-    from fusecap.files import safe_name
-    from fusecap.stored_take import read_provenance
+def set_aside_earlier(take: Path, files: Iterable[Path]) -> None:
+    """After a take was written: of what is listed as made from it, `files` are; others go aside."""
+    from fusecap.exports.made_files import set_aside_others
 
-    try:
-        names = read_provenance(path).get("exports")
-    except TakeError:
-        return set()
-    ours = re.compile(re.escape(safe_name(path.stem)) + r"[_.][^/\\\0]+")
-    listed = names if isinstance(names, list) else []
-    return {path.with_name(str(name)) for name in listed if ours.fullmatch(str(name))}
-
-
-def _set_aside(paths: Iterable[Path]) -> None:
-    from fusecap.exports.take_files import set_aside
-
-    for aside in set_aside(sorted(paths)):
-        note(f"{aside.name} is of an earlier solve: renamed, and nothing of it was lost")
+    for aside in set_aside_others(take, files):
+        note(f"{aside.name} is of an earlier take: renamed, and nothing of it was lost")
 
 
 def finish(solved: Solved, files: list[Path], as_json: bool) -> None:

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from fusecap.cli.common import Json, length_m, named, print_json
+from fusecap.cli.common import Json, length_m, named_once, print_json, set_aside_earlier
 from fusecap.cli.terminal import console, wrote
 from fusecap.errors import InputError
 
@@ -67,7 +67,7 @@ def edit(
         raise InputError(f"{target} exists: an earlier edit; delete it, or name another with --out")
     options = EditOptions(
         only=tuple(only or ()),
-        rename=dict(named("--rename", text, "OLD=NEW") for text in rename or ()),
+        rename=named_once("--rename", rename, "OLD=NEW"),
         start_s=start_s,
         end_s=end_s,
         gaps_above_deg=gaps_above,
@@ -79,6 +79,7 @@ def edit(
     original = open_take(take)
     edited = edit_take(original, options)
     save_take(edited, target)
+    set_aside_earlier(target, [])
     edits = list(edited.provenance["edits"])[len(original.provenance.get("edits", ())) :]
     if as_json:
         print_json({"files": [str(target)], "edits": edits})

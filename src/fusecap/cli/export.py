@@ -37,7 +37,8 @@ def export(
     in the run; fusecap solve makes better ones.
     """
     from fusecap.batch.replay import open_take
-    from fusecap.exports.take_files import export_all
+    from fusecap.exports.made_files import list_made
+    from fusecap.exports.take_files import plan_files
     from fusecap.exports.take_format import ExportOptions
     from fusecap.sources.session_cameras import common_landmarks, open_rig
     from fusecap.sources.session_file import load_session
@@ -47,8 +48,9 @@ def export(
     if session is not None:
         loaded = load_session(session)
         options = ExportOptions(cameras=open_rig(loaded)[0], landmarks=common_landmarks(loaded))
-    files = export_all(
-        open_take(take),
+    opened = open_take(take)
+    planned = plan_files(
+        opened,
         out or take.parent,
         formats=exports.formats,
         stem=take.stem,
@@ -56,6 +58,11 @@ def export(
         rig=exports.rig,
         options=options,
     )
+    files: list[Path] = []
+    for file in planned:
+        file.write(opened)
+        files.append(file.path)
+        list_made(take, files)
     if as_json:
         print_json({"files": [str(path) for path in files]})
     else:

@@ -39,6 +39,7 @@ def report(
     from fusecap.batch.report_page import report_page
     from fusecap.batch.seen import look_back
     from fusecap.batch.solved_inputs import inputs_beside, open_solved_inputs
+    from fusecap.exports.made_files import list_made
     from fusecap.files import check_writable, write_whole
 
     target = out or take.with_name(f"{take.stem}_report.html")
@@ -62,6 +63,7 @@ def report(
             findings = inputs.findings
     page = report_page(opened, take.stem, seen=seen, findings=findings, notes=notes)
     write_whole(target, page)
+    list_made(take, [target])
     if as_json:
         result: dict[str, Any] = {"files": [str(target)], "notes": notes}
         print_json(result)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from fusecap.cli.common import Json, named, print_json
+from fusecap.cli.common import Json, named_once, print_json
 from fusecap.cli.terminal import console, table_of, wrote
 from fusecap.files import safe_name
 
@@ -40,6 +40,7 @@ def retarget(
     """
     from fusecap.batch.replay import open_take
     from fusecap.exports.characters.retarget import retarget as onto
+    from fusecap.exports.made_files import list_made
 
     whose = "" if subject is None else f"_{safe_name(subject)}"
     stem = f"{take.stem}{whose}_{safe_name(character.stem)}"
@@ -49,8 +50,9 @@ def retarget(
         character,
         out or take.with_name(stem + ending),
         subject=subject,
-        bones=dict(named("--map", text, "BONE=NAME") for text in map or ()),
+        bones=named_once("--map", map, "BONE=NAME"),
     )
+    list_made(take, [done.path])
     if as_json:
         print_json({"files": [str(done.path)], "bones": done.bones, "scale": done.scale})
         return

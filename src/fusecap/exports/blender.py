@@ -19,6 +19,19 @@ from typing import Any
 from fusecap.errors import InputError
 
 VARIABLE = "FUSECAP_BLENDER"
+_FBX_FROM_GLB = """
+bpy.ops.wm.read_factory_settings(use_empty=True)
+scene = bpy.context.scene
+scene.render.fps = max(1, round(told["rate_hz"]))
+scene.render.fps_base = scene.render.fps / told["rate_hz"]
+bpy.ops.import_scene.gltf(filepath=told["glb"], disable_bone_shape=True)
+scene.frame_start, scene.frame_end = 0, told["frames"] - 1
+bpy.ops.export_scene.fbx(
+    filepath=told["fbx"], object_types={"ARMATURE", "MESH"}, add_leaf_bones=False,
+    bake_anim_use_all_actions=False, bake_anim_use_nla_strips=False,
+    bake_anim_simplify_factor=0.0, bake_anim_step=told["step"],
+)
+"""
 
 
 def run_in_blender(script: str, told: Mapping[str, Any], makes: Path) -> None:
@@ -32,6 +45,12 @@ def run_in_blender(script: str, told: Mapping[str, Any], makes: Path) -> None:
     if not makes.exists():
         last = (run.stderr.strip() or run.stdout.strip() or "no word").splitlines()[-1]
         raise InputError(f"{command[0]} wrote no {makes.suffix.upper()[1:]}: {last}")
+
+
+def fbx_from_glb(glb: Path, fbx: Path, *, rate_hz: float, frames: int, step: int = 1) -> None:
+    """Bakes each `step`-th frame; raises `InputError` without Blender."""
+    told = {"rate_hz": rate_hz, "frames": frames, "step": step, "glb": str(glb), "fbx": str(fbx)}
+    run_in_blender(_FBX_FROM_GLB, told, fbx)
 
 
 def blender_command() -> list[str]:

@@ -1,7 +1,7 @@
 """Keypoints as OpenPose JSON: a folder per camera, a file per frame.
 
     left_000000000012_keypoints.json
-    {"version": 1.3, "people": [{"person_id": [-1], "pose_keypoints_2d": [x, y, c, ...]}, ...]}
+    {"version":1.3,"people":[{"person_id":[-1],"pose_keypoints_2d":[x,y,c,...]},...]}
 
 x, y in pixels, c 0-1; a missing keypoint is 0, 0, 0. A frame's file takes its name only once it is
 whole, so a folder is valid whenever the writer dies; `detection.json` beside the frames
@@ -10,7 +10,6 @@ whole, so a folder is valid whenever the writer dies; `detection.json` beside th
 
 from __future__ import annotations
 
-import json
 import os
 import re
 from pathlib import Path
@@ -30,17 +29,25 @@ def frame_path(folder: Path, camera: str, number: int) -> Path:
     return folder / f"{safe_name(camera)}_{number:012d}_keypoints.json"
 
 
+def frame_text(people: Float[np.ndarray, "n k 3"]) -> str:
+    """A frame's JSON: pixels to a thousandth, confidences to five digits.
+
+    One format string per person takes half the time of `json`.
+    """
+    count, keypoints, _ = people.shape
+    table = np.where(people[:, :, 2:] > 0, people, 0.0).reshape(count, 3 * keypoints)
+    person = '{"person_id":[-1],"pose_keypoints_2d":['
+    person += ",".join(["%.3f,%.3f,%.5g"] * keypoints) + "]}"
+    entries = ",".join([person % tuple(values) for values in table.tolist()])
+    return f'{{"version":1.3,"people":[{entries}]}}'
+
+
 def write_frame(folder: Path, camera: str, number: int, people: Float[np.ndarray, "n k 3"]) -> None:
     """Writes one frame, whole or not at all; raises `InputError` with the system's reason."""
-    values = np.where(people[:, :, 2:] > 0, people, 0.0)
-    values = np.concatenate([values[:, :, :2].round(3), values[:, :, 2:].round(5)], axis=2)
-    entries = [
-        {"person_id": [-1], "pose_keypoints_2d": person.ravel().tolist()} for person in values
-    ]
     path = frame_path(folder, camera, number)
     part = path.with_name(f".{path.name}.part")
     try:
-        part.write_text(json.dumps({"version": 1.3, "people": entries}), encoding="utf-8")
+        part.write_text(frame_text(people), encoding="utf-8")
         os.replace(part, path)
     except OSError as error:
         raise InputError(f"cannot write {path}: {error.strerror or error}") from error

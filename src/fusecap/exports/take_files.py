@@ -7,7 +7,6 @@ are ever the same file.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,9 +17,6 @@ from fusecap.exports.rigs import rig_preset
 from fusecap.exports.take_format import UNITS_PER_M, ExportOptions, TakeFormat
 from fusecap.files import distinct_names, safe_name
 from fusecap.take import Take
-
-_EARLIER = "earlier"
-"""Put before the ending of a file that a new solve did not write again."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -91,26 +87,6 @@ def export_take(
     )
 
 
-def export_all(
-    take: Take,
-    folder: Path | str,
-    *,
-    formats: Sequence[str],
-    stem: str,
-    unit: str | None = None,
-    rig: str = "native",
-    options: ExportOptions | None = None,
-) -> list[Path]:
-    """`export_take` in each format; a unit or a rig goes to the formats that have a choice.
-
-    Raises `InputError` where none of them has that choice, before anything is written.
-    """
-    files = plan_files(
-        take, folder, formats=formats, stem=stem, unit=unit, rig=rig, options=options
-    )
-    return write_files(take, files)
-
-
 def plan_files(
     take: Take,
     folder: Path | str,
@@ -121,7 +97,10 @@ def plan_files(
     rig: str = "native",
     options: ExportOptions | None = None,
 ) -> list[TakeFile]:
-    """What `export_all` writes; raises as it does."""
+    """What to write in each format; a unit or a rig goes to the formats that have a choice.
+
+    Raises `InputError` where none of them has that choice.
+    """
     chosen = check_formats(formats, unit=unit, rig=rig, options=options)
     base = Path(folder) / safe_name(stem)
     return [file for each in chosen for file in _planned(take, base, *each)]
@@ -162,27 +141,6 @@ def write_files(take: Take, files: Iterable[TakeFile]) -> list[Path]:
         file.write(take)
         paths.append(file.path)
     return paths
-
-
-def set_aside(paths: Iterable[Path]) -> list[Path]:
-    """Renames those of an earlier take's exports that are there; returns the new paths.
-
-    `duo_ben.bvh` becomes `duo_ben.earlier1.bvh`, so nobody takes it for a result of the take beside
-    it. Raises `TakeError` with the system's reason.
-    """
-    return [_renamed(path) for path in paths if path.exists()]
-
-
-def _renamed(path: Path) -> Path:
-    """To a name that no file has."""
-    bare = path.name.removesuffix(path.suffix)
-    names = (f"{bare}.{_EARLIER}{number}{path.suffix}" for number in itertools.count(1))
-    aside = next(path.with_name(name) for name in names if not path.with_name(name).exists())
-    try:
-        path.replace(aside)
-    except OSError as error:
-        raise TakeError(f"cannot rename {path}: {error.strerror or error}") from error
-    return aside
 
 
 def _known_format(name: str) -> TakeFormat:

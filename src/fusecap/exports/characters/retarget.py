@@ -21,11 +21,11 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from fusecap.errors import InputError
-from fusecap.exports.blender import run_in_blender
+from fusecap.exports.blender import fbx_from_glb, run_in_blender
 from fusecap.exports.characters.bone_names import BoneMap, bone_map
 from fusecap.exports.characters.character import Character, read_character
-from fusecap.exports.formats.fbx import fbx_from_glb
 from fusecap.exports.gltf import Gltf
+from fusecap.exports.library import written_by_name
 from fusecap.exports.rig_motion import RigMotion, rig_motion, short_way
 from fusecap.exports.rigs import PRESETS
 from fusecap.geometry.two_bone import STRETCHED, least_turns, two_bone_turns
@@ -95,7 +95,10 @@ def retarget(
         glb = out if out.suffix.lower() != ".fbx" else Path(folder) / "moved.glb"
         _write(read, placed, motion, glb)
         if glb != out:
-            fbx_from_glb(glb, out, rate_hz=take.rate_hz, frames=len(take.timestamps_ns))
+            frames = len(take.timestamps_ns)
+            written_by_name(
+                out, lambda fbx: fbx_from_glb(glb, fbx, rate_hz=take.rate_hz, frames=frames)
+            )
     return Retargeted(
         path=out,
         bones={bone: read.names[node] for bone, node in mapped.bones.items()}

@@ -13,16 +13,19 @@ import shutil
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from fusecap.body.landmarks import LandmarkSet, landmark_set_named
 from fusecap.body.pose import landmarks_in_world
 from fusecap.errors import InputError, TakeError
-from fusecap.exports.openpose import write_frame
+from fusecap.exports.openpose import frame_path, frame_text
 from fusecap.exports.take_format import ExportOptions, TakeFormat
 from fusecap.files import distinct_names
 from fusecap.geometry.camera import Camera
 from fusecap.take import Take
+
+_AT_ONCE = 1000
+"""Frames, so that memory does not grow with the take."""
 
 
 def write_openpose(take: Take, path: Path, options: ExportOptions) -> None:
@@ -37,12 +40,14 @@ def write_openpose(take: Take, path: Path, options: ExportOptions) -> None:
     try:
         try:
             cameras = options.cameras.cameras
-            names = distinct_names(camera.name for camera in cameras)
-            for camera, name in zip(cameras, names, strict=True):
-                folder = part / name
+            folders = [part / name for name in distinct_names(camera.name for camera in cameras)]
+            for folder in folders:
                 folder.mkdir(parents=True)
-                for frame, people in enumerate(_seen(take, camera, landmarks)):
-                    write_frame(folder, camera.name, frame, people[take.tracked[:, frame]])
+            for first in range(0, len(take.timestamps_ns), _AT_ONCE):
+                piece = take.of_frames(first, first + _AT_ONCE)
+                places = [_landmarks_m(piece, row, landmarks) for row in range(len(piece.tracked))]
+                for camera, folder in zip(cameras, folders, strict=True):
+                    _write_camera(folder, first, camera, piece.tracked, places)
             if path.exists():
                 shutil.rmtree(path)
             part.replace(path)
@@ -52,24 +57,35 @@ def write_openpose(take: Take, path: Path, options: ExportOptions) -> None:
         raise TakeError(f"cannot write {path}: {error.strerror or error}") from error
 
 
-def _seen(take: Take, camera: Camera, landmarks: LandmarkSet) -> Float[np.ndarray, "t s k 3"]:
-    """Pixels and confidence of everybody, 0 where not in the picture."""
-    people, frames = take.tracked.shape
-    seen = np.zeros((frames, people, len(landmarks.landmark_names), 3))
-    for row, name in enumerate(take.subject_names):
-        mine = landmarks.of(name)
-        tracked = take.tracked[row]
-        places = landmarks_in_world(
-            take.bone_position_in_world_m[row, tracked],
-            take.bone_rotation_in_world(row)[tracked],
-            mine.bones(take.skeleton),
-            mine.offsets_m(take.shape(row)),
-        )
+def _landmarks_m(take: Take, row: int, landmarks: LandmarkSet) -> Float[np.ndarray, "t k 3"]:
+    """Of one person in the frames that they are tracked in."""
+    mine = landmarks.of(take.subject_names[row])
+    tracked = take.tracked[row]
+    return landmarks_in_world(
+        take.bone_position_in_world_m[row, tracked],
+        take.bone_rotation_in_world(row)[tracked],
+        mine.bones(take.skeleton),
+        mine.offsets_m(take.shape(row)),
+    )
+
+
+def _write_camera(
+    folder: Path,
+    first: int,
+    camera: Camera,
+    tracked: Bool[np.ndarray, "s t"],
+    places_m: list[Float[np.ndarray, "_ k 3"]],
+) -> None:
+    """Frames from `first`; the whole folder is renamed at last, so none of them is."""
+    seen = np.zeros((*tracked.T.shape, places_m[0].shape[1], 3))
+    for row, places in enumerate(places_m):
         pixels = camera.project(places.reshape(-1, 3)).reshape(*places.shape[:2], 2)
         inside = np.all((pixels >= 0) & (pixels <= np.array(camera.size_px) - 1), axis=2)
         keypoints = np.concatenate([pixels, np.ones((*pixels.shape[:2], 1))], axis=2)
-        seen[tracked, row] = np.where(inside[:, :, None], keypoints, 0.0)
-    return seen
+        seen[tracked[row], row] = np.where(inside[:, :, None], keypoints, 0.0)
+    for frame, people in enumerate(seen):
+        text = frame_text(people[tracked[:, frame]])
+        frame_path(folder, camera.name, first + frame).write_bytes(text.encode())
 
 
 FORMAT = TakeFormat(suffix=".openpose", write=write_openpose, per_person=False)
