@@ -36,6 +36,8 @@ def session(tmp_path_factory) -> Path:
         ("solve",),
         ("export",),
         ("angles",),
+        ("report",),
+        ("overlay",),
         ("doctor",),
         ("live",),
         ("view",),

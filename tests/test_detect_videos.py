@@ -244,7 +244,7 @@ def test_broken_record_says_what_to_do(tmp_path):
 def test_overlay_shows_every_frame(tmp_path):
     cameras = two_videos(tmp_path)[:1]
     detect_videos(cameras, NumberReader())
-    (path,) = draw_overlays(cameras, COCO)
+    (path,) = draw_overlays(cameras, COCO).files
     info = probe(path)
     assert path.name == "a_overlay.mp4" and info.frames == 12 and info.rate_hz == 30.0
     assert info.size_px == (64, 48)

@@ -7,14 +7,18 @@ the solve thought. Detections that belong to nobody of the take are counted as o
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from fusecap.batch.solve import Instants
+from fusecap.body.landmarks import LandmarkSet
 from fusecap.body.pose import landmarks_in_world
 from fusecap.errors import TakeError
+from fusecap.geometry.camera import Camera
+from fusecap.geometry.quaternions import from_wxyz
 from fusecap.geometry.same_people import same_people
 from fusecap.progress import Progress
 from fusecap.setup import Setup
@@ -71,13 +75,13 @@ def look_back(
     every = max(1, -(-len(instants) // MOST_INSTANTS))
     looked = range(0, len(instants), every)
     found = [instants.detections(instant) for instant in looked]
-    rows = _frames_at(take, np.array([each.timestamp_ns for each in found], dtype=np.int64))
+    rows = frames_at(take, np.array([each.timestamp_ns for each in found], dtype=np.int64))
     kept = np.flatnonzero(rows >= 0)
     if not len(kept):
         raise TakeError("the take and its session share no instant; are they of one recording?")
     frames = rows[kept]
     people, cameras = len(take.subject_names), setup.rig.cameras
-    pixels = _pixels(take, setup, frames)
+    pixels = posed_keypoints(take, setup.landmarks, cameras, frames)
     keypoints = np.zeros((people, len(cameras), len(frames)), dtype=np.int64)
     residual_px = np.full(keypoints.shape, np.nan)
     others = np.zeros((len(cameras), len(frames)), dtype=np.int64)
@@ -86,7 +90,7 @@ def look_back(
         for row in range(len(cameras)):
             detected = found[at].people[row]
             there = pixels[row, :, column]
-            subjects, persons = same_people(there, detected, gate_extents=GATE_EXTENTS)
+            subjects, persons = paired(there, detected)
             others[row, column] = len(detected) - len(persons)
             for subject, person in zip(subjects, persons, strict=True):
                 away = np.linalg.norm(there[subject, :, :2] - detected[person][:, :2], axis=1)
@@ -111,7 +115,7 @@ def look_back(
     )
 
 
-def _frames_at(take: Take, times_ns: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+def frames_at(take: Take, times_ns: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
     """The take's frame at each time, -1 where none is within half a period."""
     known_ns = take.timestamps_ns
     if not len(known_ns):
@@ -123,25 +127,38 @@ def _frames_at(take: Take, times_ns: Int[np.ndarray, " n"]) -> Int[np.ndarray, "
     return np.where(away_ns.min(axis=0) <= 0.5e9 / take.rate_hz, nearest, -1)
 
 
-def _pixels(take: Take, setup: Setup, frames: Int[np.ndarray, " n"]) -> Float[np.ndarray, "..."]:
-    """(C, S, N, K, 3) everybody's landmarks as keypoints; NaN, NaN, 0 where nothing is imaged."""
-    landmarks, skeleton = setup.landmarks, setup.skeleton
+def posed_keypoints(
+    take: Take, landmarks: LandmarkSet, cameras: Sequence[Camera], frames: Int[np.ndarray, " n"]
+) -> Float[np.ndarray, "c s n k 3"]:
+    """Everybody's landmarks as keypoints of every camera; NaN, NaN, 0 where nothing is imaged."""
     count = len(landmarks.landmark_names)
-    pixels = np.zeros((len(setup.rig), len(take.subject_names), len(frames), count, 3))
+    pixels = np.zeros((len(cameras), len(take.subject_names), len(frames), count, 3))
     pixels[..., :2] = np.nan
+    bones = landmarks.bones(take.skeleton)
     for subject, name in enumerate(take.subject_names):
         tracked = take.tracked[subject, frames]
+        if not tracked.any():
+            continue
+        quaternion = take.bone_rotation_in_world_wxyz[subject, frames[tracked]]
+        rotation = from_wxyz(quaternion.reshape(-1, 4)).as_matrix()
         points = landmarks_in_world(
             take.bone_position_in_world_m[subject, frames[tracked]],
-            take.bone_rotation_in_world(subject)[frames[tracked]],
-            landmarks.bones(skeleton),
+            rotation.reshape(*quaternion.shape[:2], 3, 3),
+            bones,
             landmarks.of(name).offsets_m(take.shape(subject)),
         )
-        for row, camera in enumerate(setup.rig.cameras):
+        for row, camera in enumerate(cameras):
             seen = camera.project(points.reshape(-1, 3)).reshape(-1, count, 2)
             pixels[row, subject, tracked, :, :2] = seen
             pixels[row, subject, tracked, :, 2] = np.isfinite(seen).all(axis=2)
     return pixels
+
+
+def paired(
+    posed: Float[np.ndarray, "s k 3"], detected: Float[np.ndarray, "n k 3"]
+) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]]:
+    """Which people's poses, and which detections in one picture, are of the same person."""
+    return same_people(posed, detected, gate_extents=GATE_EXTENTS)
 
 
 def _sensors(

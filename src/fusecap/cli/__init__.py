@@ -34,6 +34,7 @@ from fusecap.cli import (
     export,
     init,
     live,
+    overlay,
     report,
     retarget,
     simulate,
@@ -82,6 +83,7 @@ app.command(epilog=solve.EXAMPLE)(solve.solve)
 app.command(epilog=edit.EXAMPLE)(edit.edit)
 app.command(epilog=export.EXAMPLE)(export.export)
 app.command(epilog=angles.EXAMPLE)(angles.angles)
+app.command(epilog=overlay.EXAMPLE)(overlay.overlay)
 app.command(epilog=report.EXAMPLE)(report.report)
 app.command(epilog=retarget.EXAMPLE)(retarget.retarget)
 app.command(epilog=doctor.EXAMPLE)(doctor.doctor)

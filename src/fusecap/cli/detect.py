@@ -88,18 +88,19 @@ def detect(
         detector = build_detector(options, show)
         setup = video_setup(session, cameras, detector.landmarks) if session else None
         found = detect_videos(cameras, detector, setup=setup, progress=show)
-        files = []
+        drawn = None
         if overlay and not found.interrupted:
             from fusecap.batch.overlay import draw_overlays
 
-            files = draw_overlays(cameras, detector.landmarks, show)
+            drawn = draw_overlays(cameras, detector.landmarks, show)
+    files = [] if drawn is None else drawn.files
     if as_json:
         print_json(found.as_json() | {"files": [str(path) for path in files]})
     else:
         print_detection(found)
         wrote(*files)
     _warn(found)
-    if found.interrupted:
+    if found.interrupted or (drawn is not None and drawn.interrupted):
         err.print("interrupted: what was found until then is kept; the same command goes on")
         raise typer.Exit(130)
 

@@ -6,11 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from fusecap.body.shape import end_offsets_m
+from fusecap.exports.stick_figures import Sticks, TakeSticks, passing
 from fusecap.files import write_picture
 from fusecap.take import Take
 
@@ -20,61 +19,49 @@ _VIEWS = {
     "top": (0, 2),
 }
 """Title to horizontal and vertical axis."""
-_SIDE_WIDTH = {"left": 2.2, "right": 1.0}
+_LEFT_WIDTH, _WIDTH, _RIGHT_WIDTH = 2.2, 1.6, 1.0
 """The left side of a body is drawn thicker, so that mirrored poses are seen."""
+_GREY = "0.65"
+"""Of passers-by, and of bones that nothing measures."""
 
 
 def plot_take(take: Take, frames: Sequence[int], path: Path | str) -> None:
-    """One row of front, side and top views per frame, a colour per subject, written as a PNG."""
+    """One row of front, side and top views per frame, a colour per subject, written as a PNG.
+
+    Passers-by are grey, and do not widen a view; bones that nothing measures are dotted and grey.
+    """
     figure = Figure(figsize=(15, 4.6 * len(frames)), layout="constrained")
     axes = figure.subplots(len(frames), len(_VIEWS), squeeze=False)
+    figures, passes_by = TakeSticks(take), passing(take.tracked)
+    order = np.argsort(passes_by, kind="stable").tolist()
     for row, frame in zip(axes, frames, strict=True):
         for ax, (title, view) in zip(row, _VIEWS.items(), strict=True):
-            for subject, name in enumerate(take.subject_names):
-                if take.tracked[subject, frame]:
-                    _draw(ax, take, subject, frame, view, f"C{subject % 10}", name)
             _dress(ax, view, f"{take.time_s[frame]:.2f} s, {title}")
+            for subject in order:
+                sticks = figures.at_frame(subject, frame)
+                if sticks is not None:
+                    if passes_by[subject]:
+                        ax.autoscale_view()
+                        ax.set_autoscale_on(False)
+                    colour = _GREY if passes_by[subject] else f"C{subject % 10}"
+                    _draw(ax, sticks, view, colour, take.subject_names[subject])
         if row[0].get_legend_handles_labels()[0]:
             row[0].legend(loc="upper right", fontsize=8)
     write_picture(figure, Path(path))
 
 
-def _draw(
-    ax: Axes,
-    take: Take,
-    subject: int,
-    frame: int,
-    view: tuple[int, int],
-    colour: str,
-    label: str,
-) -> None:
-    horizontal, vertical = view
-    for index, (name, start, end) in enumerate(_sticks(take, subject, frame)):
+def _draw(ax: Axes, sticks: Sticks, view: tuple[int, int], colour: str, label: str) -> None:
+    for row, (start, end) in enumerate(zip(sticks.start_m, sticks.end_m, strict=True)):
+        horizontal, vertical = ([start[axis], end[axis]] for axis in view)
+        width = _LEFT_WIDTH if sticks.left[row] else _RIGHT_WIDTH if sticks.right[row] else _WIDTH
         ax.plot(
-            [start[horizontal], end[horizontal]],
-            [start[vertical], end[vertical]],
-            color=colour,
-            linewidth=_SIDE_WIDTH.get(name.partition("_")[0], 1.6),
-            solid_capstyle="round",
-            label=label if index == 0 else None,
+            horizontal,
+            vertical,
+            color=colour if sticks.measured[row] else _GREY,
+            linewidth=width,
+            linestyle="-" if sticks.measured[row] else ":",
+            label=label if row == 0 else None,
         )
-
-
-def _sticks(
-    take: Take, subject: int, frame: int
-) -> list[tuple[str, Float[np.ndarray, "3"], Float[np.ndarray, "3"]]]:
-    """Bone name, start and end in the world [m]: joint to parent joint, and the leaves' ends."""
-    position = take.bone_position_in_world_m[subject, frame]
-    rotation = take.bone_rotation_in_world(subject)[frame]
-    sticks = [
-        (take.bone_names[bone], position[parent], position[bone])
-        for bone, parent in enumerate(take.parents)
-        if parent >= 0
-    ]
-    for name, offset in end_offsets_m(take.shape(subject)).items():
-        bone = take.bone_names.index(name)
-        sticks.append((name, position[bone], position[bone] + rotation[bone] @ offset))
-    return sticks
 
 
 def _dress(ax: Axes, view: tuple[int, int], title: str) -> None:

@@ -26,7 +26,7 @@ from fusecap.progress import Progress
 from fusecap.sources.detection_files import read_record
 from fusecap.sources.imu_files import ImuTrack
 from fusecap.sources.keypoint_files import KeypointTrack
-from fusecap.sources.session import Session
+from fusecap.sources.session import CameraSettings, Session
 from fusecap.sources.session_cameras import (
     broken_files,
     camera_track,
@@ -47,6 +47,7 @@ from fusecap.sources.synchronizer import (
     people_at,
     resample_imus,
 )
+from fusecap.sources.video import Video
 from fusecap.types import Detections, ImuReading
 
 T = TypeVar("T")
@@ -284,6 +285,22 @@ def unplaced_wearers(session: Session) -> list[Finding]:
 def session_clocks(session: Session) -> Clocks:
     """Those of the session's `sync` file; of one without, everybody's times are right."""
     return Clocks() if session.settings.sync is None else read_sync(session.settings.sync)
+
+
+def video_times_s(session: Session, camera: CameraSettings, video: Video) -> np.ndarray:
+    """(F,) when the frames of a camera's video were exposed, on the session's clock.
+
+    A constant rate is taken as such, without the container's rounding, and the rate of keypoints
+    that number the frames is that of the frames.
+    """
+    rate_hz = camera.rate_hz
+    if rate_hz is None and camera.keypoints is not None and read_record(camera.keypoints) is None:
+        rate_hz = session.camera_rate_hz(camera)
+    if rate_hz is None and video.info.is_variable_rate:
+        own_s = video.times_ns * 1e-9
+    else:
+        own_s = np.arange(video.info.frames) / (rate_hz or video.info.rate_hz)
+    return session_clocks(session).camera(camera.name).session_s(own_s + camera.offset_s)
 
 
 def solve_times_s(

@@ -14,7 +14,8 @@ from jaxtyping import Float, UInt8
 
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.engine.engine import LiveStep
-from fusecap.exports.overlay import LINKS
+from fusecap.exports.overlay import draw_limbs, draw_solved
+from fusecap.exports.stick_figures import StickFigure
 from fusecap.geometry.camera import Camera, Rig
 from fusecap.types import CameraImage, CameraSample
 from fusecap.viewer.figure import Pose, pose_of
@@ -23,8 +24,6 @@ from fusecap.viewer.palette import Rgb
 WIDTH_PX = 320
 RATE_HZ = 5.0
 _DETECTED_RGB = (255, 255, 255)
-_DRAWN_FROM = 0.1
-"""Confidence below which a keypoint is not drawn."""
 _EMPTY_GREY = 70
 
 Picture = UInt8[np.ndarray, "h w 3"]
@@ -35,8 +34,7 @@ class Pictures:
 
     def __init__(self, rig: Rig, landmarks: LandmarkSet) -> None:
         self._rig = rig
-        links = [(landmarks.index(a), landmarks.index(b)) for a, b in LINKS]
-        self._links = [(a, b) for a, b in links if a is not None and b is not None]
+        self._landmarks = landmarks
         self._waiting: list[CameraImage | None] = [None] * len(rig)
         self._samples: list[CameraSample | None] = [None] * len(rig)
         self._shown_ns = [-(1 << 62)] * len(rig)
@@ -95,7 +93,9 @@ class Pictures:
         if found is not None:
             self._draw_found(picture, found * [_shrink(camera), _shrink(camera), 1.0])
         for name, pose in poses.items():
-            _draw_solved(picture, camera, pose, colours[name])
+            figure = StickFigure(pose.shape.skeleton)
+            sticks = figure.sticks(pose.shape, pose.position_m, pose.rotation, pose.quality)
+            draw_solved(picture, camera, sticks, colours[name], scale=_shrink(camera))
         self.drawn[row] = picture
 
     def _due(self, camera: int, timestamp_ns: int) -> bool:
@@ -103,10 +103,7 @@ class Pictures:
 
     def _draw_found(self, picture: Picture, people: Float[np.ndarray, "n k 3"]) -> None:
         for person in people:
-            seen = person[:, 2] >= _DRAWN_FROM
-            for a, b in self._links:
-                if seen[a] and seen[b]:
-                    _line(picture, person[a], person[b], _DETECTED_RGB, 1)
+            draw_limbs(picture, person, self._landmarks, _DETECTED_RGB, 1)
 
 
 def mosaic(pictures: Sequence[Picture], names: Sequence[str]) -> Picture:
@@ -146,17 +143,3 @@ def _small(image: CameraImage) -> Picture:
     size = WIDTH_PX, max(round(height * WIDTH_PX / width), 1)
     small = cv2.resize(image.image, size, interpolation=cv2.INTER_AREA)
     return cv2.cvtColor(small, cv2.COLOR_BGR2RGB)
-
-
-def _draw_solved(picture: Picture, camera: Camera, pose: Pose, colour: Rgb) -> None:
-    pixels = camera.project(pose.position_m) * _shrink(camera)
-    for bone, parent in enumerate(pose.shape.skeleton.parents):
-        if parent >= 0 and np.isfinite(pixels[[bone, parent]]).all():
-            _line(picture, pixels[parent], pixels[bone], colour, 2)
-
-
-def _line(picture: Picture, start: np.ndarray, end: np.ndarray, colour: Rgb, width: int) -> None:
-    """Ends far outside, as of people beside a camera, are left out: they overflow OpenCV."""
-    if max(np.abs(start[:2]).max(), np.abs(end[:2]).max()) < 8 * WIDTH_PX:
-        a, b = ((round(float(p[0])), round(float(p[1]))) for p in (start, end))
-        cv2.line(picture, a, b, colour, width, cv2.LINE_AA)

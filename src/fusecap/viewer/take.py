@@ -15,6 +15,7 @@ from viser import GuiEvent
 from fusecap.body.shape import BodyShape
 from fusecap.body.skeleton import Skeleton
 from fusecap.errors import TakeError
+from fusecap.exports.stick_figures import passing
 from fusecap.geometry.camera import Rig
 from fusecap.take import Take
 from fusecap.viewer.controls import PlaybackControls
@@ -87,7 +88,8 @@ class TakePage:
             ]
             for box in self._boxes:
                 box.on_update(lambda _: self._controls.nudge())
-        everywhere = places_of(list(seen.bone_position_in_world_m[:, :, 0]))
+        stay = ~passing(take.tracked)
+        everywhere = places_of(list(seen.bone_position_in_world_m[stay, :, 0]))
         add_view_controls(page, room, lambda: everywhere)
         self._views = detections and detections.views(page.gui, colours)
         self._plots = self._add_plots([sigma_curve(seen, take.time_s[frames]), *curves], colours)

@@ -26,9 +26,9 @@ from fusecap.live.devices.paced_sources import (
 from fusecap.live.devices.source import Deliver, Delivery, SessionClock, Source
 from fusecap.progress import Progress
 from fusecap.sources.keypoint_files import read_keypoints
-from fusecap.sources.session import CameraSettings, Session
+from fusecap.sources.session import Session
 from fusecap.sources.session_cameras import common_landmarks
-from fusecap.sources.session_data import session_clocks
+from fusecap.sources.session_data import session_clocks, video_times_s
 from fusecap.sources.session_sensors import open_imus
 from fusecap.sources.video import Video
 from fusecap.types import ImuSample
@@ -180,7 +180,7 @@ def _cameras(
             yield Keypoints(index, track, clock.session_s(track.times_s))
         elif camera.video is not None:
             video = Video(camera.video)
-            times_s = clock.session_s(_exposed_s(video, camera))
+            times_s = video_times_s(session, camera, video)
             shown = _thinned(times_s, options.image_rate_hz)
             if options.in_memory:
                 yield HeldPictures(index, camera.name, video, times_s, shown, progress)
@@ -209,13 +209,6 @@ def _sensors(session: Session) -> Iterator[PacedSource]:
                 for bone, track in zip(bones, tracks, strict=True)
             ]
             yield PacedSensors(subject.name, bones, tracks, times_s)
-
-
-def _exposed_s(video: Video, camera: CameraSettings) -> Float[np.ndarray, " f"]:
-    """On the camera's clock; a constant rate without the container's rounding."""
-    if camera.rate_hz is None and video.info.is_variable_rate:
-        return video.times_ns * 1e-9 + camera.offset_s
-    return np.arange(video.info.frames) / (camera.rate_hz or video.info.rate_hz) + camera.offset_s
 
 
 def _thinned(times_s: Float[np.ndarray, " f"], rate_hz: float | None) -> Int[np.ndarray, " n"]:
