@@ -6,23 +6,25 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from fusecap.body.landmarks import landmark_set_named
 from fusecap.body.pose import forward_kinematics, landmarks_in_world
 from fusecap.body.shape import BodyShape
 from fusecap.body.skeleton import PAPER21
-from fusecap.checks.people import _check_stature
+from fusecap.checks.people import _check_stature, _check_upright
 from fusecap.cli import app
 from fusecap.doctor import diagnose
 from fusecap.errors import CalibrationError, SessionError
 from fusecap.findings import Findings
+from fusecap.geometry.camera import Rig
 from fusecap.solve.body_measure import BodyMeasure
 from fusecap.sources.calibration_files import load_rig
 from fusecap.sources.session import Session
 from fusecap.sources.session_data import open_session
 from fusecap.sources.session_file import load_session
-from session_files import calibration_toml, edit, imu_csv, ring, write_session
+from session_files import calibration_toml, camera_at, edit, imu_csv, ring, write_session
 
 BODY25 = landmark_set_named("body25")
 
@@ -114,6 +116,25 @@ def test_people_upside_down_before_upright_cameras_are_no_reason_to_turn_the_wor
                 person["pose_keypoints_2d"] = points.ravel().tolist()
             file.write_text(json.dumps({"people": people}))
     assert not any("away from up" in text for text in said(path))
+
+
+@pytest.mark.parametrize(("facing_deg", "told"), [(90, False), (200, False), (0, True)])
+def test_who_lies_below_cameras_at_the_ceiling_lies_and_the_world_stands(facing_deg, told):
+    lying = Rotation.from_euler("xy", [-90, facing_deg], degrees=True)
+    shape = BodyShape.from_height(PAPER21, 1.7)
+    posed = forward_kinematics(shape, np.zeros((1, PAPER21.pose_size)))
+    rest = landmarks_in_world(*posed, BODY25.bones(PAPER21), BODY25.offsets_m(shape))[0]
+    people = np.repeat(lying.apply(rest)[None], 20, axis=0)
+    cameras = [
+        camera_at(f"c{i}", [x, 3.0, 0.01], target_m=[x, 0.0, 0.0]) for i, x in enumerate((-1, 1))
+    ]
+    session = Session.model_validate(
+        {"session": {"name": "sleep"}, "camera": [{"name": "c", "keypoints": "k"}]},
+        context={"file": Path("session.toml")},
+    )
+    findings = Findings()
+    _check_upright(session, Rig(cameras=tuple(cameras)), people, BODY25, findings)
+    assert any("away from up" in str(finding) for finding in findings) is told
 
 
 def test_an_unstated_rate_is_said_to_be_assumed(tmp_path):

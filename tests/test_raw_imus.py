@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from fusecap.doctor import diagnose
 from fusecap.errors import InputError
 from fusecap.geometry.quaternions import from_wxyz
 from fusecap.sources.imu_files.loader import imu_format_of, read_imu
@@ -109,3 +110,28 @@ def test_a_walker_is_upright_by_raw_sensors(data_dir, tmp_path, segment):
     track = read_imu(path, format="csv")
     mean = from_wxyz(track.orientation_wxyz).apply(track.accel_m_s2).mean(axis=0)
     assert np.hypot(*mean[:2]) < 0.1 and mean[2] == pytest.approx(GRAVITY_M_S2, rel=0.05)
+
+
+@pytest.mark.parametrize(("written_in", "told"), [(np.pi / 180, "deg/s"), (180 / np.pi, "rad/s")])
+def test_rates_of_another_unit_are_refused_by_its_name(tmp_path, written_in, told):
+    header, first = "time_s", None
+    if told == "rad/s":  # a DOT's are degrees
+        count = np.arange(len(TIMES_S), dtype=float)[:, None]
+        header, first = "PacketCounter,SampleTimeFine", np.hstack([count, 1e4 * count])
+        written_in = 1.0
+    path = written(tmp_path / "a.csv", header, written_in, first=first)
+    with pytest.raises(InputError, match=f"gyroscope is in {told}"):
+        read_imu(path, format=imu_format_of(path))
+
+
+def test_a_sensor_that_faces_nobody_knows_where_is_an_error_until_that_is_found(tmp_path):
+    written(tmp_path / "hips.csv", "time_s")
+    text = (
+        '[session]\nname = "raw"\n[[subject]]\nname = "A"\n[[subject.imu]]\nbone = "hips"\n'
+        'file = "hips.csv"\nbone_from_imu_wxyz = [1, 0, 0, 0]\n'
+    )
+    (tmp_path / "session.toml").write_text(text)
+    errors = [f for f in diagnose(tmp_path) if f.severity == "error"]
+    assert len(errors) == 1 and "without a magnetometer" in errors[0].found
+    (tmp_path / "session.toml").write_text(text + "heading_deg = 20\n")
+    assert not [f for f in diagnose(tmp_path) if f.severity == "error"]

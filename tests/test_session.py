@@ -270,3 +270,14 @@ def test_a_window_of_two_is_refused(tmp_path):
     edit(write_session(tmp_path), "[session]", "[estimator]\nwindow = 2\n\n[session]")
     with pytest.raises(InputError, match="3-1000 instants, or 1"):
         solve_session(open_session(load_session(tmp_path)))
+
+
+def test_cameras_whose_names_differ_in_odd_characters_have_folders_of_their_own(tmp_path):
+    path = tmp_path / "session.toml"
+    cameras = "".join(
+        f'[[camera]]\nname = "{name}"\nvideo = "v.mp4"\n' for name in ("a/1", "a?1", "A_1")
+    )
+    path.write_text(f'[session]\nname = "s"\ncalibration = "c.toml"\n{cameras}')
+    session = parse_session(path)
+    folders = [session.detection_folder(camera).name for camera in session.cameras]
+    assert folders == ["a_1", "a_1_2", "A_1_3"]

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from fusecap.associate.track import Track
 from fusecap.body.landmarks import LandmarkSet
@@ -31,7 +31,7 @@ FITS = 0.25
 """Sensors and limbs of one person are nearer: limbs are off by 41 degrees here."""
 MARGIN = 0.12
 """By which one pairing must be better than another, per person: 28 degrees."""
-_MIN_LIMBS = 3
+MIN_LIMBS = 3
 
 _LIMBS: dict[str, tuple[tuple[str, str], ...]] = {
     "hips": (("right_hip", "left_hip"),),
@@ -57,24 +57,14 @@ class SensorVote:
 
     def __init__(self, landmark_set: LandmarkSet, worn: Mapping[str, Sequence[str]]) -> None:
         """`worn` has, per subject, the bones of its sensors in the order of its readings."""
-        names = landmark_set.landmark_names
-        rest = _at_rest(landmark_set)
         self._rows: dict[str, np.ndarray] = {}
         """Per wearer and limb the sensor, and the landmarks at the limb's ends (l, 3)."""
         self._rest: dict[str, np.ndarray] = {}
         """Unit directions (l, 3) in the bone's frame."""
         for name, bones in worn.items():
-            rows = [
-                (sensor, names.index(a), names.index(b))
-                for sensor, bone in enumerate(bones)
-                for a, b in _LIMBS.get(bone, ())
-                if a in names and b in names
-            ]
-            if len(rows) >= _MIN_LIMBS:
-                table = np.array(rows)
-                along = rest[table[:, 2]] - rest[table[:, 1]]
-                self._rows[name] = table
-                self._rest[name] = along / np.linalg.norm(along, axis=1, keepdims=True)
+            rows, rest = limbs_of(landmark_set, bones)
+            if len(rows) >= MIN_LIMBS:
+                self._rows[name], self._rest[name] = rows, rest
         self.heard: frozenset[str] = frozenset()
         """Who says something at this instant."""
         self._mean: dict[Track, dict[str, tuple[float, float]]] = {}
@@ -116,7 +106,7 @@ class SensorVote:
         rows = self._rows[name]
         turned = reading.bone_rotation_in_world[rows[:, 0]]
         expected = np.einsum("lij,lj->li", turned, self._rest[name])
-        if np.isfinite(expected[:, 0]).sum() < _MIN_LIMBS:
+        if np.isfinite(expected[:, 0]).sum() < MIN_LIMBS:
             return None
         limb = landmarks[:, rows[:, 2]] - landmarks[:, rows[:, 1]]
         length = np.linalg.norm(limb, axis=2)
@@ -124,12 +114,32 @@ class SensorVote:
         known = np.isfinite(off)
         count = known.sum(axis=1)
         mean = np.where(known, off, 0.0).sum(axis=1) / np.maximum(count, 1)
-        return np.where(count >= _MIN_LIMBS, mean, np.nan)
+        return np.where(count >= MIN_LIMBS, mean, np.nan)
 
     def misfit(self, track: Track, name: str, least_s: float) -> float:
         """Mean d of a track and a wearer; NaN where heard for less."""
         mean, heard_s = self._mean.get(track, {}).get(name, (0.0, -1.0))
         return mean if heard_s >= least_s else np.nan
+
+
+def limbs_of(
+    landmark_set: LandmarkSet, bones: Sequence[str]
+) -> tuple[Int[np.ndarray, "l 3"], Float[np.ndarray, "l 3"]]:
+    """Limbs that tell how sensors on these bones turn: sensor, two landmarks; where they point.
+
+    Directions are unit vectors in the bone's frame, from the first landmark to the second.
+    """
+    names = landmark_set.landmark_names
+    rows = [
+        (sensor, names.index(a), names.index(b))
+        for sensor, bone in enumerate(bones)
+        for a, b in _LIMBS.get(bone, ())
+        if a in names and b in names
+    ]
+    table = np.array(rows, dtype=np.int64).reshape(-1, 3)
+    rest = _at_rest(landmark_set)
+    along = rest[table[:, 2]] - rest[table[:, 1]]
+    return table, along / np.linalg.norm(along, axis=1, keepdims=True)
 
 
 def _at_rest(landmark_set: LandmarkSet) -> Float[np.ndarray, "k 3"]:

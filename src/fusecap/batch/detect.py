@@ -34,7 +34,7 @@ from fusecap.body.landmarks import LandmarkSet
 from fusecap.detect.detector import Detector, DetectorOptions
 from fusecap.errors import InputError, SessionError
 from fusecap.exports import openpose
-from fusecap.files import plain, safe_name
+from fusecap.files import distinct_names, plain
 from fusecap.pipeline import Pipeline
 from fusecap.progress import Progress
 from fusecap.setup import Setup, setup_of
@@ -129,14 +129,15 @@ def session_videos(
     Keypoints go to a folder per camera under `out`, else where the session looks for them. Raises
     `InputError` for a video that cannot be read.
     """
+    names = distinct_names(camera.name for camera in session.cameras)
     return [
         CameraVideo(
             name=camera.name,
             video=Video(camera.video),
-            folder=out / safe_name(camera.name) if out else session.detection_folder(camera),
+            folder=out / name if out else session.detection_folder(camera),
             offset_s=camera.offset_s,
         )
-        for camera in session.cameras
+        for camera, name in zip(session.cameras, names, strict=True)
         if camera.video is not None and not (undetected and camera.keypoints is not None)
     ]
 
@@ -151,8 +152,8 @@ def loose_videos(paths: Sequence[Path], out: Path) -> list[CameraVideo]:
             "file"
         )
     return [
-        CameraVideo(name=path.stem, video=Video(path), folder=out / safe_name(path.stem))
-        for path in paths
+        CameraVideo(name=path.stem, video=Video(path), folder=out / folder)
+        for path, folder in zip(paths, distinct_names(names), strict=True)
     ]
 
 

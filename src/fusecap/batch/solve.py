@@ -103,13 +103,13 @@ def solve_session(
     found = check_measurements(data.session, data.rig, data.keypoints, data.samples, data.times_s)
     if not anyway:
         refuse_errors(data.session, [*data.findings, *found])
-    odd = [finding for finding in found.sorted() if finding.severity != "info"]
+    odd = [f for f in (*data.findings, *found.sorted()) if f.severity != "info"]
     return solve_instants(
         setup_of(data.session, data.rig, data.landmarks),
         SessionInstants(data),
         progress=progress,
         session_sha256=data.content_hash,
-        notes=tuple(str(finding) for finding in (*data.findings, *odd)),
+        notes=tuple(map(str, odd)),
     )
 
 

@@ -63,6 +63,14 @@ def _check_imu(where: str, imu: ImuSettings, track: ImuTrack, findings: Findings
             f"samples come at {track.rate_hz:.1f} Hz",
             "record at 60 Hz or more; below 20 Hz fast motion is lost",
         )
+    if not track.heading_known and "heading_deg" not in imu.model_fields_set:
+        findings.add(
+            "error",
+            where,
+            "found without a magnetometer, it faces another way than the others, nobody knows "
+            "which",
+            "fusecap calibrate imu finds heading_deg from motion the cameras saw; or state it",
+        )
     _check_gravity(where, imu, track, findings)
 
 

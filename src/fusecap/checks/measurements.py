@@ -8,6 +8,7 @@ import numpy as np
 
 from fusecap.checks.imus import check_imus
 from fusecap.checks.keypoints import check_keypoints
+from fusecap.checks.limbs import check_limbs
 from fusecap.checks.people import check_people
 from fusecap.checks.views import ComparedViews, check_views
 from fusecap.findings import Findings
@@ -44,6 +45,7 @@ def check_measurements(
     if views is not None:
         check_views(views, findings)
         check_people(session, views, findings)
+        check_limbs(session, views, imus, findings)
     return findings
 
 

@@ -15,7 +15,6 @@ from fusecap.body.skeleton import PAPER21
 from fusecap.checks.views import ComparedViews
 from fusecap.findings import Findings
 from fusecap.geometry.camera import Rig
-from fusecap.sources import view_agreement
 from fusecap.sources.calibration_files.loader import Y_UP_FROM
 from fusecap.sources.session import Session, SubjectSettings
 
@@ -27,6 +26,8 @@ differs by more."""
 NEAR_SHARE = 0.3
 """Of people as tall as stated: with so many a scale is right, and others are somebody else."""
 TILTED = np.cos(np.radians(45))
+WITH_CAMERAS = 0.5
+"""Cosine of people to the tops of pictures: who lies below cameras at the ceiling lies anyhow."""
 LEAST_PEOPLE = 5
 LEAST_FACES = 20
 BACKWARDS_SHARE = 0.8
@@ -36,7 +37,7 @@ LIMBS = (("hip", "knee"), ("knee", "ankle"), ("shoulder", "elbow"), ("elbow", "w
 def check_people(session: Session, views: ComparedViews, findings: Findings) -> None:
     """Which way people stand, how tall they are, where their feet are, where they look."""
     landmarks = views.tracks[0].landmarks
-    people = view_agreement.people_in_world(views.rig, views.tracks, views.times_s)
+    people = np.concatenate(views.people)
     if len(people) < LEAST_PEOPLE:
         return
     _check_sides(people, landmarks, findings)
@@ -60,7 +61,8 @@ def _check_upright(
     direction = np.median(body / np.linalg.norm(body, axis=1, keepdims=True), axis=0)
     direction /= max(float(np.linalg.norm(direction)), 1e-9)
     if direction[1] < TILTED:
-        if _cameras_up(rig)[1] < TILTED:
+        up = _cameras_up(rig)
+        if up[1] < TILTED and direction @ up > WITH_CAMERAS:
             _add_tilted(session, direction, findings)
         return
     ankle_m = float(np.median(feet[:, 1]))

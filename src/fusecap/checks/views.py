@@ -47,6 +47,8 @@ class ComparedViews:
     """(T,) over what all cameras cover."""
     fast_s: np.ndarray
     """(T,) those at which people move most."""
+    people: list[np.ndarray]
+    """Of `times_s`, as `view_agreement.people_in_world`."""
 
     @classmethod
     def of(cls, rig: Rig, keypoints: Sequence[KeypointTrack]) -> ComparedViews | None:
@@ -66,11 +68,13 @@ class ComparedViews:
         every_s = start + np.arange(0, count, step) / fastest_hz
         speeds = _speeds(tracks, every_s)
         fast = np.sort(np.argsort(-speeds, kind="stable")[: max(1, len(every_s) // FAST_SHARE)])
+        times_s = every_s[:: max(1, len(every_s) // SAMPLED_INSTANTS)]
         return cls(
             rig=rig,
             tracks=tuple(tracks),
-            times_s=every_s[:: max(1, len(every_s) // SAMPLED_INSTANTS)],
+            times_s=times_s,
             fast_s=every_s[fast],
+            people=view_agreement.people_in_world(rig, tracks, times_s),
         )
 
     def disagreement_px(self, times_s: np.ndarray) -> np.ndarray:
@@ -167,8 +171,13 @@ def _cause(views: ComparedViews, index: int, own_px: float, fast_px: float) -> s
         scaled = _scaled(track, scale)
         left_px = views.with_track(index, scaled).own_px(index, views.times_s)
         causes.append((left_px / own_px, _resolution_remedy(views, index, scale, left_px)))
-    share, remedy = min(causes, key=lambda cause: cause[0])
+    share, remedy = min(causes, key=lambda cause: _known(cause[0]))
     return remedy if share < EXPLAINED else None
+
+
+def _known(value: float) -> float:
+    """Infinite for what nobody measured, which is then least of nothing."""
+    return value if np.isfinite(value) else np.inf
 
 
 def _shift(views: ComparedViews, index: int, fast_px: float) -> tuple[float, str]:
@@ -207,7 +216,7 @@ def _check_resolution(views: ComparedViews, pairs_px: np.ndarray, findings: Find
     for scale in RESOLUTIONS:
         scaled = replace(views, tracks=tuple(_scaled(track, scale) for track in views.tracks))
         left[scale] = _median(scaled.disagreement_px(views.times_s))
-    best = min(left, key=lambda scale: left[scale])
+    best = min(left, key=lambda scale: _known(left[scale]))
     if not left[best] < EXPLAINED * typical_px:
         return False
     findings.add(

@@ -7,7 +7,6 @@ it names.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated, Any
@@ -28,6 +27,7 @@ from fusecap.body.landmarks import LANDMARK_SETS
 from fusecap.body.shape import MAX_HEIGHT_M, MIN_HEIGHT_M
 from fusecap.body.skeleton import Skeleton, skeleton_named
 from fusecap.errors import InputError, MotionError, nearest
+from fusecap.files import distinct_names
 from fusecap.sources.imu_files import formats as imu_formats
 from fusecap.sources.live_address import parse_camera_address, parse_imu_address
 
@@ -379,7 +379,9 @@ class Session(_Table):
 
     def detection_folder(self, camera: CameraSettings) -> Path:
         """Where keypoints that are detected in a camera's video go."""
-        return self.folder / "keypoints" / re.sub(r"[^\w.-]", "_", camera.name)
+        names = [each.name for each in self.cameras]
+        folder = distinct_names(names)[names.index(camera.name)]
+        return self.folder / "keypoints" / folder
 
     def camera_rate_hz(self, camera: CameraSettings) -> float:
         """A camera's frame rate."""

@@ -13,10 +13,12 @@ from fusecap.findings import Finding
 from fusecap.geometry.quaternions import from_wxyz
 from fusecap.sources.imu_files import ImuTrack, read_imu
 from fusecap.sources.session import ImuSettings, Session, SubjectSettings
-from fusecap.sources.synchronizer import MountedImu, world_from_imu_world
+from fusecap.sources.synchronizer import MAX_GAP_S, MountedImu, world_from_imu_world
 
 LEAST_COMMON = 0.5
 """Of the shortest recording: of sensors that share less of it by their clock, it is not one."""
+LONG_GAP_S, LOST_SHARE = 0.5, 0.05
+"""Radio drops some of nearly every sensor's samples; beyond these motion is missing."""
 TPOSE_MOVED_DEG = 15.0
 """95th percentile from a sensor's mean orientation: twice what people's T-poses are off anyway."""
 _NOT_SYNCHRONISED = "its counter is not on the other sensors' clock"
@@ -89,29 +91,15 @@ def sensor_notes(subject: SubjectSettings, tracks: Sequence[ImuTrack | None]) ->
 
     Lost samples are one finding per subject: radio drops some of nearly every sensor's.
     """
-    findings, lost, alone = [], [], []
+    findings, alone = [], []
     for imu, track in zip(subject.imus, tracks, strict=True):
         for note in () if track is None else track.notes:
-            if "samples lost" in note:
-                lost.append((imu.bone, note))
-            elif note == _NOT_SYNCHRONISED:
+            if note == _NOT_SYNCHRONISED:
                 alone.append(imu.bone)
             else:
                 where = f"imu '{imu.bone}' of '{subject.name}'"
                 findings.append(Finding(severity="warning", where=where, found=note, remedy=""))
-    if lost:
-        each = ", ".join(f"{bone} {note.replace(' samples lost', '')}" for bone, note in lost)
-        single = len(lost) == 1
-        findings.append(
-            Finding(
-                severity="warning",
-                where=f"imu '{lost[0][0]}' of '{subject.name}'"
-                if single
-                else f"sensors of '{subject.name}'",
-                found=lost[0][1] if single else f"samples lost: {each}",
-                remedy="gaps over 0.1 s are not bridged",
-            )
-        )
+    findings += _lost_samples(subject, tracks)
     if alone:
         findings.append(
             Finding(
@@ -123,6 +111,26 @@ def sensor_notes(subject: SubjectSettings, tracks: Sequence[ImuTrack | None]) ->
             )
         )
     return findings
+
+
+def _lost_samples(subject: SubjectSettings, tracks: Sequence[ImuTrack | None]) -> list[Finding]:
+    lost, grave = [], False
+    for imu, track in zip(subject.imus, tracks, strict=True):
+        if track is not None and (track.gaps > 0).any():
+            count, gaps = int(track.gaps.sum()), int(np.count_nonzero(track.gaps > 0))
+            lost.append((imu.bone, f"{count} in {gaps} gap{'s' if gaps > 1 else ''}"))
+            grave |= float(np.diff(track.times_s).max()) > LONG_GAP_S
+            grave |= count > LOST_SHARE * (count + len(track.times_s))
+    if not lost:
+        return []
+    return [
+        Finding(
+            severity="warning" if grave else "info",
+            where=f"sensors of '{subject.name}'",
+            found=f"samples lost: {', '.join(f'{bone} {found}' for bone, found in lost)}",
+            remedy=f"gaps over {MAX_GAP_S:g} s are not bridged",
+        )
+    ]
 
 
 def without_unplaced_sensors(session: Session) -> tuple[Session, list[Finding]]:

@@ -160,17 +160,27 @@ def camera_disagreement_px(
     return float(known[(len(known) - 1) // 2]) if len(known) else float("inf")
 
 
-def people_in_world(rig: Rig, tracks: Sequence[KeypointTrack], times_s: np.ndarray) -> np.ndarray:
-    """(n, K, 3) landmarks [m] of people whom pairs of views agree about; NaN where not seen."""
+def people_in_world(
+    rig: Rig, tracks: Sequence[KeypointTrack], times_s: np.ndarray
+) -> list[np.ndarray]:
+    """Per instant (n, K, 3) landmarks [m] of people whom pairs of views agree about.
+
+    Everyone once per pair; NaN where a landmark is not seen.
+    """
+    return [_people_in_world(rig, tracks, t_s) for t_s in times_s.tolist()]
+
+
+def _people_in_world(rig: Rig, tracks: Sequence[KeypointTrack], t_s: float) -> np.ndarray:
     found = [np.empty((0, len(tracks[0].landmarks.landmark_names), 3))]
-    views = [[people_at(track, t) for t in times_s] for track in tracks]
+    views = [people_at(track, t_s) for track in tracks]
     for i, j in _pairs(len(tracks)):
         first, second = rig.cameras[i], rig.cameras[j]
-        for a, b in zip(views[i], views[j], strict=True):
-            rows, columns, cost = pair_distances_px(first, second, a, b)
-            good = cost < 0.01 * np.hypot(*first.size_px)
-            if good.any():
-                found.append(_triangulated(first, second, a[rows[good]], b[columns[good]]))
+        rows, columns, cost = pair_distances_px(first, second, views[i], views[j])
+        good = cost < 0.01 * np.hypot(*first.size_px)
+        if good.any():
+            found.append(
+                _triangulated(first, second, views[i][rows[good]], views[j][columns[good]])
+            )
     return np.concatenate(found)
 
 

@@ -46,6 +46,8 @@ class ImuTrack:
     notes: tuple[str, ...] = ()
     """What was wrong with the file and has been dealt with."""
     clock: SharedClock | None = None
+    heading_known: bool = True
+    """Whether other sensors share the imu_world; else each faces anywhere."""
 
     @property
     def rate_hz(self) -> float:
@@ -53,6 +55,14 @@ class ImuTrack:
         if len(self.times_s) < 2:
             return float("nan")
         return float(1.0 / np.median(np.diff(self.times_s)))
+
+    @property
+    def gaps(self) -> np.ndarray:
+        """(N - 1,) how many samples were lost after each but the last."""
+        step = np.diff(self.times_s)
+        if len(step) == 0:
+            return np.empty(0, dtype=np.int64)
+        return np.maximum(np.round(step / np.median(step)).astype(np.int64) - 1, 0)
 
 
 def tidy(
@@ -63,6 +73,7 @@ def tidy(
     *,
     clock: SharedClock | None = None,
     notes: tuple[str, ...] = (),
+    heading_known: bool = True,
 ) -> ImuTrack:
     """A track from raw columns; raises `InputError` when no sample is left.
 
@@ -93,12 +104,6 @@ def tidy(
     fresh = np.concatenate([[True], np.diff(times_s) > 0])
     _note(said, ~fresh, "{} duplicate timestamps dropped")
     times_s, quaternion, accel = times_s[fresh], quaternion[fresh], accel[fresh]
-    if len(times_s) > 2:
-        step = np.diff(times_s)
-        lost = np.round(step / np.median(step)).astype(int) - 1
-        gaps = np.count_nonzero(lost > 0)
-        if gaps:
-            said.append(f"{lost[lost > 0].sum()} samples lost in {gaps} gaps")
     measured = np.all(np.isfinite(accel), axis=1, keepdims=True)
     return ImuTrack(
         times_s=times_s,
@@ -106,6 +111,7 @@ def tidy(
         accel_m_s2=np.where(measured, accel, np.nan),
         notes=tuple(said),
         clock=clock,
+        heading_known=heading_known,
     )
 
 

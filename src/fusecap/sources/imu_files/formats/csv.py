@@ -11,7 +11,7 @@ from pathlib import Path
 
 from fusecap.errors import InputError
 from fusecap.sources.imu_files.loader import ImuFormat
-from fusecap.sources.imu_files.raw import orientation_from_raw
+from fusecap.sources.imu_files.raw import Orientation, orientation_from_raw
 from fusecap.sources.imu_files.table import read_table
 from fusecap.sources.imu_files.track import ImuTrack, since_first, tidy
 
@@ -26,22 +26,22 @@ def read(path: Path, _sensor: str | None, _rate_hz: float | None) -> ImuTrack:
         raise InputError(f"{path}: no column {' or '.join(_SECONDS)}, found {table.columns[:1]}")
     times_s, clock = since_first(table.take([unit])[:, 0] * _SECONDS[unit])
     quaternion = ["qw", "qx", "qy", "qz"]
-    raw = None
+    orientation = None
     if not table.has(quaternion):
-        raw = orientation_from_raw(table, times_s, rad_s=1.0)
-    if raw is not None:
-        orientation_wxyz, said = raw
+        orientation = orientation_from_raw(table, times_s, rad_s=1.0)
+    if orientation is not None:
         accelerations, notes = table.accelerations(["Acc_X", "Acc_Y", "Acc_Z"])
     else:
-        orientation_wxyz, said = table.take(quaternion), ()
+        orientation = Orientation(table.take(quaternion))
         accelerations, notes = table.accelerations(["ax", "ay", "az"])
     return tidy(
         str(path),
         times_s,
-        orientation_wxyz,
+        orientation.wxyz,
         accelerations,
         clock=clock,
-        notes=(*said, *notes),
+        notes=(*orientation.notes, *notes),
+        heading_known=orientation.heading_known,
     )
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from fusecap.errors import InputError
 from fusecap.sources.imu_files.loader import ImuFormat
-from fusecap.sources.imu_files.raw import orientation_from_raw
+from fusecap.sources.imu_files.raw import Orientation, orientation_from_raw
 from fusecap.sources.imu_files.table import ImuTable, read_table
 from fusecap.sources.imu_files.track import (
     ImuTrack,
@@ -42,28 +42,29 @@ def read(path: Path, _sensor: str | None, _rate_hz: float | None) -> ImuTrack:
     ticks[counted] = unwrapped(ticks[counted], CLOCK_MODULUS)
     first = float(np.nanmin(ticks)) if counted.any() else 0.0
     times_s = (ticks - first) / TICKS_PER_SECOND
-    quaternion, said = _orientation_wxyz(table, times_s)
+    orientation = _orientation(table, times_s)
     if not table.has(_ACC) and table.has(_FREE_ACC):
-        accelerations, notes = specific_force(quaternion, table.take(_FREE_ACC)), ()
+        accelerations, notes = specific_force(orientation.wxyz, table.take(_FREE_ACC)), ()
     else:
         accelerations, notes = table.accelerations(_ACC)
     return tidy(
         str(path),
         times_s,
-        quaternion,
+        orientation.wxyz,
         accelerations,
         clock=SharedClock(
             start_s=first / TICKS_PER_SECOND, period_s=CLOCK_MODULUS / TICKS_PER_SECOND
         ),
-        notes=(*said, *notes),
+        notes=(*orientation.notes, *notes),
+        heading_known=orientation.heading_known,
     )
 
 
-def _orientation_wxyz(table: ImuTable, times_s: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
+def _orientation(table: ImuTable, times_s: np.ndarray) -> Orientation:
     if table.has(_QUATERNION):
-        return table.take(_QUATERNION), ()
+        return Orientation(table.take(_QUATERNION))
     if table.has(_EULER):
-        return wxyz_of_euler(table.take(_EULER)), ()
+        return Orientation(wxyz_of_euler(table.take(_EULER)))
     raw = orientation_from_raw(table, times_s, rad_s=np.pi / 180)
     if raw is not None:
         return raw

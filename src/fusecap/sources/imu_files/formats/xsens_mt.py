@@ -18,7 +18,7 @@ import numpy as np
 
 from fusecap.errors import InputError
 from fusecap.sources.imu_files.loader import ImuFormat
-from fusecap.sources.imu_files.raw import orientation_from_raw
+from fusecap.sources.imu_files.raw import Orientation, orientation_from_raw
 from fusecap.sources.imu_files.table import ImuTable, read_table
 from fusecap.sources.imu_files.track import (
     ImuTrack,
@@ -49,14 +49,15 @@ def read(path: Path, _sensor: str | None, rate_hz: float | None) -> ImuTrack:
     first = float(np.nanmin(packets))
     accelerations, notes = table.accelerations(["Acc_X", "Acc_Y", "Acc_Z"])
     times_s = (packets - first) / rate
-    orientation_wxyz, said = _orientation_wxyz(table, times_s)
+    orientation = _orientation(table, times_s)
     return tidy(
         str(path),
         times_s,
-        orientation_wxyz,
+        orientation.wxyz,
         accelerations,
         clock=SharedClock(start_s=first / rate, period_s=PACKET_MODULUS / rate),
-        notes=(*said, *notes),
+        notes=(*orientation.notes, *notes),
+        heading_known=orientation.heading_known,
     )
 
 
@@ -72,13 +73,13 @@ def _rate_hz(table: ImuTable, stated_hz: float | None) -> float:
     return stated_hz
 
 
-def _orientation_wxyz(table: ImuTable, times_s: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
+def _orientation(table: ImuTable, times_s: np.ndarray) -> Orientation:
     if table.has(_QUATERNION):
-        return table.take(_QUATERNION), ()
+        return Orientation(table.take(_QUATERNION))
     if table.has(_MATRIX):
-        return wxyz_of_matrices(table.take(_MATRIX).reshape(-1, 3, 3)), ()
+        return Orientation(wxyz_of_matrices(table.take(_MATRIX).reshape(-1, 3, 3)))
     if table.has(_EULER_XYZ):
-        return wxyz_of_euler(table.take(_EULER_XYZ)), ()
+        return Orientation(wxyz_of_euler(table.take(_EULER_XYZ)))
     raw = orientation_from_raw(table, times_s, rad_s=1.0)
     if raw is not None:
         return raw
