@@ -112,6 +112,19 @@ def test_a_take_is_right_from_the_start_though_sensors_told_late(simulation, bac
 
 
 @pytest.mark.slow
+def test_a_take_is_right_from_the_start_though_a_bystander_was_followed(simulation):
+    setup = setup_of_simulation(simulation)
+    subjects = tuple(replace(m, start_m=None) for m in setup.subjects if m.name == "anna")
+    solved = solve_instants(replace(setup, subjects=subjects), LateSensors(simulation, 120))
+    take, truth = solved.take, simulation.truth
+    true_m = truth.bone_position_in_world_m[truth.subject_names.index("anna"), :200, 0]
+    away_m = np.linalg.norm(take.bone_position_in_world_m[0, :, 0] - true_m, axis=1)
+    assert any("somebody else than was followed" in note for note in solved.report.notes)
+    assert take.tracked[0].mean() > 0.95
+    assert np.nanmax(away_m) < 0.1
+
+
+@pytest.mark.slow
 def test_sensors_that_nobody_wears_keep_nobody_out_for_ever(simulation):
     rng = np.random.default_rng(0)
 
@@ -120,8 +133,10 @@ def test_sensors_that_nobody_wears_keep_nobody_out_for_ever(simulation):
         nonsense = ImuReading(bone_rotation_in_world=turns, accel_in_world_m_s2=np.zeros((13, 3)))
         return dict.fromkeys(readings, nonsense)
 
-    *_, seen = wrong_names(simulation, pipeline_of(simulation), range(200), change)
+    _, notes, seen = wrong_names(simulation, pipeline_of(simulation), range(300), change)
     assert set(seen) == {"anna", "ben"}
+    assert sorted(note.split(":")[0] for note in notes) == ["anna", "ben"]
+    assert all("sensors and cameras contradict each other" in note for note in notes)
 
 
 def test_two_who_do_the_same_are_not_told_apart():

@@ -74,9 +74,11 @@ class Step:
 
     updates: tuple[TrackUpdate, ...]
     estimates: tuple[Estimate, ...]
-    paired_anew: Mapping[str, str] = field(default_factory=dict)
-    """Who turned out to be somebody else, by name, and under which name they were followed before;
-    empty: they were a bystander."""
+    renumbered: Mapping[int, int] = field(default_factory=dict)
+    """Of people who turned out to be others than was thought: by the track id they had until now
+    the one that they have."""
+    bystanders: tuple[TrackUpdate, ...] = ()
+    """Who is no subject but may be one of those who wear sensors."""
     notes: tuple[str, ...] = ()
     """What a user should know, in words."""
 
@@ -187,11 +189,13 @@ class Pipeline:
         else:
             results = list(self._pool.map(lambda item: _follow(*item), work))
         self._detections = detections
+        tracker = self._sorter if isinstance(self._sorter, Tracker) else None
         self._step = Step(
             updates=tuple(updates),
             estimates=tuple(estimate for estimate in results if estimate is not None),
-            paired_anew=self._sorter.paired_anew if isinstance(self._sorter, Tracker) else {},
-            notes=tuple(self._sorter.notes) if isinstance(self._sorter, Tracker) else (),
+            renumbered=tracker.renumbered if tracker else {},
+            bystanders=tuple(tracker.bystanders) if tracker else (),
+            notes=tuple(tracker.notes) if tracker else (),
         )
         return self._step
 
@@ -299,8 +303,9 @@ class Pipeline:
                 self._sorter.hear(readings)
             updates = self._sorter.update(detections, predicted, detections.timestamp_ns)
             if isinstance(self._sorter, Tracker):
-                for name in self._sorter.paired_anew:
-                    self._estimators.pop(name, None)
+                for update in updates:
+                    if update.track_id in self._sorter.renumbered.values():
+                        self._estimators.pop(update.name, None)
         sorted_names = {update.name for update in updates}
         if self._looked_ns is None or detections.looked is None or any(detections.looked):
             self._looked_ns = detections.timestamp_ns

@@ -70,6 +70,11 @@ class SensorVote:
         self._mean: dict[Track, dict[str, tuple[float, float]]] = {}
         """Per track and wearer: the mean, and for how many seconds it was heard."""
 
+    @property
+    def of_anybody(self) -> bool:
+        """Whether somebody wears enough sensors."""
+        return bool(self._rows)
+
     def hear(
         self,
         tracks: Sequence[Track],

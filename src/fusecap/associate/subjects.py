@@ -49,6 +49,10 @@ class Place:
     start_m: tuple[float, float] | None
     track: Track | None = None
     live: bool = False
+    misfit_since_ns: int | None = None
+    """Since when sensors say that whoever is followed here does not wear them."""
+    told: bool = False
+    """Whether a user knows that."""
 
 
 class Cast:
@@ -139,12 +143,11 @@ class Cast:
             or (place.track and (now_ns - place.track.seen_ns) * 1e-9 <= o.memory_s)
         ]
 
-    def pair_anew(self, tracks: Sequence[Track], vote: SensorVote) -> dict[str, str]:
+    def pair_anew(self, tracks: Sequence[Track], vote: SensorVote) -> dict[int, int]:
         """Give wearers the tracks that their sensors fit, where these are clearly others.
 
-        Everyone who is tracked may be who wears them. Returns whose track changed, with the name
-        it was followed under before, empty where it was a bystander's. The identity stays with the
-        place, so who is followed under it must be solved anew.
+        Everyone who is tracked may be who wears them. The identity stays with the place, so who is
+        followed under it must be solved anew. Returns, by the id that a track had, the one it has.
         """
         places = [p for p in self._places if p.live and p.track and p.name in vote.heard]
         if not places:
@@ -163,16 +166,31 @@ class Cast:
         freed = [followed[name] for name in given if followed[name] not in given.values()]
         robbed = [n for n, t in followed.items() if n not in given and t in given.values()]
         given.update({name: freed.pop() for name in robbed})
-        numbers = {name: followed[name].track_id for name in given}
-        spare = [t.track_id for t in given.values() if t not in followed.values()]
+        spare = [track for track in given.values() if track not in followed.values()]
+        renumbered = {track.track_id: followed[name].track_id for name, track in given.items()}
+        renumbered.update(
+            {was.track_id: new.track_id for was, new in zip(freed, spare, strict=True)}
+        )
         for place in self._places:
-            if place.name in given:
-                place.track = given[place.name]
-                place.track.track_id = numbers[place.name]
-        for track, number in zip(freed, spare, strict=True):
-            track.track_id = number
-        named = {id(track): name for name, track in followed.items()}
-        return {name: named.get(id(track), "") for name, track in given.items()}
+            place.track = given.get(place.name, place.track)
+        for track in (*given.values(), *freed):
+            track.track_id = renumbered[track.track_id]
+        return renumbered
+
+    def contradicted(self, vote: SensorVote, now_ns: int) -> list[str]:
+        """Wearers whom their sensors have not fitted for `patience_s`; each is named once."""
+        found = []
+        for place in self._places:
+            track = place.track if place.live else None
+            misfit = vote.misfit(track, place.name, SURE_S) if track else np.nan
+            if misfit < FITS:
+                place.misfit_since_ns, place.told = None, False
+            elif np.isfinite(misfit):
+                since_ns = place.misfit_since_ns = place.misfit_since_ns or now_ns
+                if (now_ns - since_ns) * 1e-9 >= self._options.patience_s and not place.told:
+                    place.told = True
+                    found.append(place.name)
+        return found
 
     def admit(self, tracks: Sequence[Track], now_ns: int, vote: SensorVote) -> None:
         """Give established newcomers inside the volume a subject's place while there is one.

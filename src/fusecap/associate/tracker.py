@@ -66,8 +66,10 @@ class Tracker:
         self._last_ns: int | None = None
         self._vote = SensorVote(landmark_set, {s.name: s.sensors for s in subjects if s.sensors})
         self._readings: Mapping[str, ImuReading] = {}
-        self.paired_anew: dict[str, str] = {}
-        """Whom sensors gave another track at the last instant, and whose it was before."""
+        self.renumbered: dict[int, int] = {}
+        """Of tracks that sensors paired anew at the last instant, by the former id the new one."""
+        self.bystanders: list[TrackUpdate] = []
+        """Of the last instant, where somebody wears sensors, whom they may still fit."""
         self.notes: list[str] = []
         """What a user should know of the last instant."""
 
@@ -127,10 +129,16 @@ class Tracker:
             [tracks[row] for row in rows], measured[rows], self._readings, elapsed_ns * 1e-9
         )
         self._cast.admit(everyone, now_ns, self._vote)
-        self.paired_anew = self._cast.pair_anew(everyone, self._vote)
+        self.renumbered = self._cast.pair_anew(everyone, self._vote)
         self.notes = [
             f"{name} is somebody else than was followed: sensors say so"
-            for name in self.paired_anew
+            for name, track in self._cast.followed()
+            if track.track_id in self.renumbered.values()
+        ]
+        self.notes += [
+            f"{name}: sensors and cameras contradict each other; either nobody who is seen wears "
+            "these sensors, or their bones or headings are not as stated (fusecap calibrate imu)"
+            for name in self._cast.contradicted(self._vote, now_ns)
         ]
         for track in self._cast.kept_out:
             if not track.told and (now_ns - track.born_ns) * 1e-9 >= self._options.patience_s:
@@ -318,27 +326,34 @@ class Tracker:
         self, person: np.ndarray, measured: np.ndarray, tracks: list[Track], now_ns: int
     ) -> list[TrackUpdate]:
         row = {id(track): r for r, track in enumerate(tracks)}
-        updates = []
-        for name, track in self._cast.followed():
-            seen = track.seen_ns == now_ns
-            updates.append((track, name, TrackState.CONFIRMED if seen else TrackState.COASTING))
-        if len(updates) < self._cast.size:
-            subjects = self._cast.ids()
-            updates += [
-                (track, "", TrackState.TENTATIVE)
-                for track in self._population.tracks
-                if track.track_id not in subjects
-                and track.strong_frames > 0
-                and (not track.is_established(self._options) or self._waits(track, now_ns))
-                and self._cast.inside(track)
-            ]
-        return [
-            TrackUpdate(
+
+        def update(track: Track, name: str, state: TrackState) -> TrackUpdate:
+            return TrackUpdate(
                 track_id=track.track_id,
                 name=name,
                 state=state,
                 person=person[row[id(track)]],
                 landmarks_in_world_m=measured[row[id(track)]],
             )
-            for track, name, state in updates
+
+        updates, newcomers, subjects = [], [], self._cast.ids()
+        for name, track in self._cast.followed():
+            seen = track.seen_ns == now_ns
+            updates.append(
+                update(track, name, TrackState.CONFIRMED if seen else TrackState.COASTING)
+            )
+        others = [track for track in self._population.tracks if track.track_id not in subjects]
+        if len(updates) < self._cast.size:
+            newcomers = [
+                track
+                for track in others
+                if track.strong_frames > 0
+                and (not track.is_established(self._options) or self._waits(track, now_ns))
+                and self._cast.inside(track)
+            ]
+        self.bystanders = [
+            update(track, "", TrackState.TENTATIVE)
+            for track in others
+            if self._vote.of_anybody and track not in newcomers
         ]
+        return updates + [update(track, "", TrackState.TENTATIVE) for track in newcomers]

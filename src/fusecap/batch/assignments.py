@@ -51,13 +51,12 @@ class Assigned(NamedTuple):
 
 
 class Assignments:
-    """Written once, instant by instant; then names are settled, and instants read in any order."""
+    """Written once, instant by instant; then ids and names are settled, and instants read."""
 
     def __init__(self, *, cameras: int, landmarks: int, pose_size: int) -> None:
         self._file = tempfile.TemporaryFile(prefix="fusecap-")  # noqa: SIM115 - see `close`
         self._record = np.dtype(
             [
-                ("track_id", np.int64),
                 ("person", np.int32, (cameras,)),
                 ("landmarks_m", np.float64, (landmarks, 3)),
                 ("theta", np.float64, (pose_size,)),
@@ -74,6 +73,7 @@ class Assignments:
         self._track = array("q")
         self._tentative = array("b")
         self._seen = array("b")
+        self._seeded = array("b")
         self._confirmed: dict[int, str] = {}
         """By track, how those that were confirmed sooner or later are called."""
         self._names: list[str] = []
@@ -98,11 +98,11 @@ class Assignments:
             self._track.append(update.track_id)
             self._tentative.append(tentative)
             self._seen.append(bool((update.person >= 0).any()))
-            record["track_id"], record["person"] = update.track_id, update.person
+            record["person"] = update.person
             record["state"] = _STATES.index(update.state)
             record["landmarks_m"] = update.landmarks_in_world_m
             estimate = None if tentative else solved.get(update.name)
-            record["status"] = -1
+            self._seeded.append(estimate is not None)
             if estimate is not None:
                 record["theta"], record["cost"] = estimate.theta, estimate.cost
                 record["solve_s"] = estimate.solve_s
@@ -111,9 +111,21 @@ class Assignments:
         self._file.write(records.tobytes())
         self._first.append(len(self._track))
 
+    def landmarks_m(self, instant: int) -> dict[int, Float[np.ndarray, "k 3"]]:
+        """By track what was measured of everybody at an instant, NaN where nothing was."""
+        rows = self._rows(instant)
+        found = zip(rows, self._read(rows), strict=True)
+        return {self._track[row]: record["landmarks_m"] for row, record in found}
+
+    def renumber(self, instant: int, renumbered: Mapping[int, int]) -> None:
+        """Tracks get other ids at an instant; poses that were found for others are no seeds."""
+        for row in self._rows(instant):
+            if self._track[row] in renumbered:
+                self._track[row] = renumbered[self._track[row]]
+                self._seeded[row] = False
+
     def settle(self) -> None:
         """Tracks that were confirmed sooner or later bear their subject's name from the start."""
-        self._file.flush()
         self._names = sorted(set(self._confirmed.values()))
         number = {name: index for index, name in enumerate(self._names)}
         by_track = {track: number[name] for track, name in self._confirmed.items()}
@@ -142,12 +154,9 @@ class Assignments:
         rows = self._rows(instant)
         if all(self._name[row] == _NOBODY for row in rows):
             return []
-        self._file.seek(rows.start * self._record.itemsize)
-        raw = self._file.read(len(rows) * self._record.itemsize)
-        records = np.frombuffer(bytearray(raw), dtype=self._record)
         return [
-            self._assigned(record, self._names[self._name[row]])
-            for row, record in zip(rows, records, strict=True)
+            self._assigned(row, record)
+            for row, record in zip(rows, self._read(rows), strict=True)
             if self._name[row] != _NOBODY
         ]
 
@@ -159,14 +168,6 @@ class Assignments:
             if self._name[row] != _NOBODY
         }
 
-    def rename(self, instant: int, now: Mapping[str, str]) -> None:
-        """Who is called otherwise at an instant, by the name until now."""
-        self._names += [name for name in now.values() if name not in self._names]
-        for row in self._rows(instant):
-            if self._name[row] != _NOBODY:
-                name = self._names[self._name[row]]
-                self._name[row] = self._names.index(now.get(name, name))
-
     def keep(self, instant: int, names: Collection[str]) -> None:
         """Nobody else is at an instant."""
         for row in self._rows(instant):
@@ -176,15 +177,20 @@ class Assignments:
     def _rows(self, instant: int) -> range:
         return range(self._first[instant], self._first[instant + 1])
 
-    def _assigned(self, record: np.void, name: str) -> Assigned:
+    def _read(self, rows: range) -> np.ndarray:
+        self._file.seek(rows.start * self._record.itemsize)
+        raw = self._file.read(len(rows) * self._record.itemsize)
+        return np.frombuffer(bytearray(raw), dtype=self._record)
+
+    def _assigned(self, row: int, record: np.void) -> Assigned:
         update = TrackUpdate(
-            track_id=int(record["track_id"]),
-            name=name,
+            track_id=self._track[row],
+            name=self._names[self._name[row]],
             state=_STATES[record["state"]],
             person=record["person"],
             landmarks_in_world_m=record["landmarks_m"],
         )
-        if record["status"] < 0:
+        if not self._seeded[row]:
             return Assigned(update, None)
         seed = Seed(
             theta=record["theta"],

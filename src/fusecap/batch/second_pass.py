@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -135,6 +135,13 @@ class SecondPass:
                 self._motions[name].take(_Held(instant, update.track_id, seed, observation))
         self._open.append(instant)
         return seeds
+
+    def begin(self, names: Collection[str]) -> None:
+        """Whoever comes next under these names is not whom they were until now."""
+        for name in names:
+            self._alone.pop(name, None)
+            if name in self._motions:
+                self._motions[name].end()
 
     def finished(self) -> Iterator[Instant]:
         """Instants whose poses are their last ones, in order."""

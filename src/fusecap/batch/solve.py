@@ -179,6 +179,7 @@ def _both_passes(
     try:
         for instant in range(len(assigned)):
             detections, readings = instants.detections(instant), instants.readings(instant)
+            second.begin(tracked.begun.get(instant, ()))
             for seed in second.step(detections, readings, assigned[instant]):
                 solve_s.append(seed.solve_s)
                 statuses[seed.status.name.lower()] += 1

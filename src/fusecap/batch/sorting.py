@@ -5,16 +5,16 @@ Sorts and solves every instant, each alone, and learns the bodies of people nobo
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from fusecap.associate.sensor_vote import SensorVote
+from fusecap.associate.sensor_vote import FITS, SensorVote
 from fusecap.batch.assignments import Assignments
 from fusecap.body.shape import BodyShape
-from fusecap.pipeline import Pipeline, worn_sensors
+from fusecap.pipeline import Pipeline, Step, worn_sensors
 from fusecap.progress import Progress
 from fusecap.setup import Setup
 from fusecap.types import Detections, ImuReading
@@ -45,6 +45,8 @@ class Sorted:
 
     shapes: dict[str, BodyShape]
     """Of everybody who was followed."""
+    begun: Mapping[int, Collection[str]]
+    """By instant, who must be found there anew: until then somebody else was followed."""
     interrupted: bool
     notes: tuple[str, ...]
 
@@ -57,60 +59,65 @@ def sort_instants(
     options = replace(setup.options, window=window, seeding=True)
     pipeline = Pipeline(replace(setup, options=options))
     notes: list[str] = []
-    moved: list[tuple[int, Mapping[str, str]]] = []
+    moved: list[tuple[int, Step]] = []
     interrupted = False
     try:
         for instant in range(len(instants)):
             step = pipeline.step(instants.detections(instant), instants.readings(instant))
-            assigned.add(step.updates, step.estimates)
+            assigned.add([*step.updates, *step.bystanders], step.estimates)
             notes += [f"{instant / setup.rate_hz:.2f} s: {note}" for note in step.notes]
-            moved += [(instant, step.paired_anew)] if step.paired_anew else []
+            moved += [(instant, step)] if step.renumbered else []
             if progress:
                 progress("sorting", instant + 1, len(instants))
     except KeyboardInterrupt:
         interrupted = True
-    assigned.settle()
     vote = SensorVote(setup.landmarks, worn_sensors(setup))
-    for instant, former in moved:
-        _rename_before(assigned, instant, former, instants, vote)
+    begun: dict[int, set[str]] = {}
+    for instant, step in moved:
+        names = {u.track_id: u.name for u in step.updates if u.name}
+        wearers = {i: names[i] for i in step.renumbered.values() if i in names}
+        since = _renumber_before(assigned, instant, step.renumbered, wearers, instants, vote)
+        begun.setdefault(since, set()).update(wearers.values())
+    assigned.settle()
     _drop_tails(assigned, instants)
     return Sorted(
         shapes={name: pipeline.estimator(name).shape for name in assigned.names},
+        begun=begun,
         interrupted=interrupted,
         notes=tuple(notes),
     )
 
 
-def _rename_before(
+def _renumber_before(
     assigned: Assignments,
     instant: int,
-    former: Mapping[str, str],
+    renumbered: Mapping[int, int],
+    wearers: Mapping[int, str],
     instants: Instants,
     vote: SensorVote,
-) -> None:
+) -> int:
     """Who turned out at an instant to be somebody else was so before: back to when it began.
 
-    That is the instant from which the new names, until then, fit the sensors better by most.
-    Nothing changes where one of them was a bystander, of whom no instant was kept.
+    That is the instant from which the new ids, until then, fit the sensors better by most; it is
+    returned. `wearers` has names by the new ids. Of whoever had no track then it counts whether
+    the other one fits.
     """
-    if not all(former.values()):
-        return
     gain = most = 0.0
     since = instant
     for row in range(instant - 1, -1, -1):
-        readings = instants.readings(row)
-        points = {one.update.name: one.update.landmarks_in_world_m for one in assigned[row]}
-        for name, before in former.items():
-            if name in readings and name in points and before in points:
-                both = np.stack([points[name], points[before]])
+        readings, points = instants.readings(row), assigned.landmarks_m(row)
+        for former, number in renumbered.items():
+            name = wearers.get(number, "")
+            if name in readings and number in points:
+                both = np.stack([points[number], points.get(former, points[number])])
                 away = vote.away(both, name, readings[name])
                 if away is not None and np.isfinite(away).all():
-                    gain += float(away[0] - away[1])
+                    gain += float(away[0] - (away[1] if former in points else FITS))
         if gain >= most:
             most, since = gain, row
-    now = {before: name for name, before in former.items()}
     for row in range(since, instant):
-        assigned.rename(row, now)
+        assigned.renumber(row, renumbered)
+    return since
 
 
 def _drop_tails(assigned: Assignments, instants: Instants) -> None:
