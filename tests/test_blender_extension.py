@@ -12,8 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import fusecap
 from export_people import NEAR_M, two_walkers, with_gap
 from fusecap.take import save_take
+from motions import person
+from test_retarget_character import character_file, in_armature, world_of
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -27,7 +30,7 @@ def extension(tmp_path) -> Path:
     )
     archive = Path(told.stdout.removeprefix("wrote ").strip())
     with zipfile.ZipFile(archive) as file:
-        assert {"__init__.py", "blender_manifest.toml"} <= {*file.namelist()}
+        assert {"__init__.py", "blender_manifest.toml", "bone_words.py"} <= {*file.namelist()}
         file.extractall(tmp_path / "extension" / "fusecap_motion")
     return tmp_path / "extension"
 
@@ -53,7 +56,7 @@ def streaming(take: Path):
 
 
 @pytest.mark.slow
-def test_a_take_and_a_live_stream_become_armatures_that_move(tmp_path, extension):
+def test_takes_and_streams_become_armatures_that_move_and_move_characters(tmp_path, extension):
     python = os.environ.get("FUSECAP_BPY_PYTHON")
     if not python:
         pytest.skip("FUSECAP_BPY_PYTHON does not name a Python with bpy")
@@ -61,17 +64,21 @@ def test_a_take_and_a_live_stream_become_armatures_that_move(tmp_path, extension
     save_take(take, tmp_path / "t.npz")
     script = ROOT / "tests" / "readers" / "blender_extension.py"
     out = tmp_path / "out.npz"
+    mixamo = character_file(tmp_path / "mixamo.glb", rig="mixamo", shape=person(1.9))
+    plain = character_file(tmp_path / "plain.glb", rig="ue5", shape=person(1.2))
+    characters = [mixamo, in_armature(plain, tmp_path / "scaled.glb")]
     with streaming(tmp_path / "t.npz") as address:
         run = subprocess.run(
-            [python, script, extension, tmp_path / "t.npz", out, address],
+            [python, script, extension, tmp_path / "t.npz", out, address, *characters],
             capture_output=True,
             text=True,
-            timeout=120,
+            timeout=240,
             check=False,
         )
     assert run.returncode == 0, run.stderr
-    assert json.loads(run.stdout.splitlines()[-1])["people"] == 2
+    assert json.loads(run.stdout.splitlines()[-1])["people"] == 3
     with np.load(out) as found:
+        tracked_first = take.tracked[0]
         for row, name in enumerate(take.subject_names):
             names = found[f"names_{name}"].tolist()
             assert {"left_pelvis", "left_clavicle"} <= {*names}
@@ -87,3 +94,12 @@ def test_a_take_and_a_live_stream_become_armatures_that_move(tmp_path, extension
             order = [names.index(n) for n in take.bone_names]
             apart = np.abs(live[:, None, order] - all_true[None]).max(axis=(2, 3)).min(axis=1)
             assert np.median(apart) < 0.02
+        for number, character in enumerate(characters):
+            fusecap.retarget(take, character, tmp_path / "r.glb", subject=take.subject_names[0])
+            expected = world_of(tmp_path / "r.glb", len(take.timestamps_ns))
+            names = found[f"character_names_{number}"].tolist()
+            for at, name in enumerate(names):
+                away = np.abs(found[f"character_{number}"][:, at] - expected[name])[tracked_first]
+                assert away.max() < NEAR_M, name
+        moved = np.ptp(found["live_character"], axis=0).max(axis=1)
+        assert len(found["live_character"]) > 60 and moved.max() > 0.1

@@ -11,6 +11,8 @@ import zipfile
 from pathlib import Path
 
 SOURCE = Path(__file__).parent / "fusecap_motion"
+SHARED = Path(__file__).parents[2] / "src/fusecap/exports/characters/bone_words.py"
+"""What the package guesses bones by; the extension has the same."""
 
 
 def main() -> None:
@@ -19,7 +21,7 @@ def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     target = folder / f"{manifest['id']}-{manifest['version']}.zip"
     with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:
-        for path in sorted(SOURCE.glob("*")):
+        for path in [*sorted(SOURCE.glob("*")), SHARED]:
             if path.suffix in (".py", ".toml"):
                 archive.write(path, path.name)
     print(f"wrote {target}")

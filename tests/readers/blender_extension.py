@@ -1,9 +1,11 @@
-"""Uses the extension as a person would: imports a take, receives a stream, bakes it.
+"""Uses the extension as a person would: imports a take, retargets, receives a stream, bakes it.
 
-    python blender_extension.py EXTENSION_FOLDER TAKE.npz OUT.npz [ws://ADDRESS]
+    python blender_extension.py EXTENSION_FOLDER TAKE.npz OUT.npz ws://ADDRESS CHARACTER.glb...
 
 EXTENSION_FOLDER holds the unpacked `fusecap_motion`. OUT receives, per armature, names and heads
-per frame in fusecap's axes: `import_*` of the take, `live_*` of the baked stream.
+per frame in fusecap's axes: `import_*` of the take, `live_*` of the baked stream, `character_<n>`
+and `character_names_<n>` of the first person's motion on each character, `live_character` of the
+stream's on the last.
 """
 
 from __future__ import annotations
@@ -33,8 +35,23 @@ def people():
     return [o for o in bpy.context.scene.objects if o.type == "ARMATURE"]
 
 
+def load_character(path: str):
+    before = {*people()}
+    bpy.ops.import_scene.gltf(filepath=path, guess_original_bind_pose=False)
+    (loaded,) = {*people()} - before
+    return loaded
+
+
+def retarget(person, character) -> None:
+    bpy.ops.object.select_all(action="DESELECT")
+    for one in (person, character):
+        one.select_set(True)
+    bpy.context.view_layer.objects.active = character
+    assert bpy.ops.object.fusecap_retarget() == {"FINISHED"}
+
+
 def main() -> None:
-    folder, take, out = sys.argv[1:4]
+    folder, take, out, address, *characters = sys.argv[1:]
     sys.path.insert(0, folder)
     import fusecap_motion
 
@@ -44,24 +61,33 @@ def main() -> None:
     with np.load(take) as file:
         frames = len(file["timestamps_ns"])
     assert bpy.ops.import_anim.fusecap_take(filepath=take) == {"FINISHED"}
-    found = {}
-    for armature in people():
+    found, imported = {}, people()
+    for armature in imported:
         found[f"import_{armature.name}"] = heads(armature, 1, frames)
         found[f"names_{armature.name}"] = np.array([b.name for b in armature.pose.bones])
-    if len(sys.argv) > 4:
-        for armature in people():
-            bpy.data.objects.remove(armature)
-        bpy.context.scene.fusecap_address = sys.argv[4]
-        bpy.context.scene.fusecap_record = True
-        assert bpy.ops.scene.fusecap_connect() == {"FINISHED"}
-        until = time.monotonic() + 3.0
-        while time.monotonic() < until:
-            fusecap_motion._timer()
-            time.sleep(0.02)
-        assert bpy.ops.scene.fusecap_disconnect() == {"FINISHED"}
-        for armature in people():
-            length = armature.animation_data.action.frame_range[1]
-            found[f"live_{armature.name}"] = heads(armature, 1, int(length))
+    for number, path in enumerate(characters):
+        character = load_character(path)
+        retarget(imported[0], character)
+        found[f"character_{number}"] = heads(character, 1, frames)
+        found[f"character_names_{number}"] = np.array([b.name for b in character.pose.bones])
+    for armature in people():
+        bpy.data.objects.remove(armature)
+    bpy.context.scene.fusecap_address = address
+    bpy.context.scene.fusecap_record = True
+    assert bpy.ops.scene.fusecap_connect() == {"FINISHED"}
+    character = load_character(characters[-1])
+    until = time.monotonic() + 3.0
+    while time.monotonic() < until:
+        fusecap_motion._timer()
+        if len(people()) > 1 and character.animation_data is None:
+            character.animation_data_create()
+            retarget(next(o for o in people() if o != character), character)
+        time.sleep(0.02)
+    assert bpy.ops.scene.fusecap_disconnect() == {"FINISHED"}
+    for armature in people():
+        length = armature.animation_data.action.frame_range[1]
+        kind = "live_character" if armature == character else f"live_{armature.name}"
+        found[kind] = heads(armature, 1, int(length))
     fusecap_motion.unregister()
     np.savez(out, **found)
     print(json.dumps({"blender": bpy.app.version_string, "people": len(people())}))

@@ -8,6 +8,7 @@ from bpy.props import BoolProperty, StringProperty
 from bpy_extras.io_utils import ImportHelper
 
 from .live import Client
+from .retarget import Follower, baked_motion
 from .skeleton import Person
 from .take_file import import_take
 
@@ -44,6 +45,8 @@ class Live:
         self.client = Client(address)
         self.people = {}
         self.recorded = {}
+        self.followers = {}
+        """Characters by the names of people whose motion they have."""
 
     def tick(self, recording):
         """Takes what has come; how long to wait for the next call, None at the end."""
@@ -55,12 +58,12 @@ class Live:
                 if recording and name in self.people:
                     kept = (frame["time_s"], pose["position_m"], pose["rotation_wxyz"])
                     self.recorded.setdefault(name, []).append(kept)
-        if frames:
-            for name, pose in frames[-1]["people"].items():
-                if name in self.people:
-                    self.people[name].show(
-                        np.array(pose["position_m"]), np.array(pose["rotation_wxyz"])
-                    )
+        for name, pose in frames[-1]["people"].items() if frames else ():
+            if name in self.people:
+                shown = self._poses(name, [pose["position_m"]], [pose["rotation_wxyz"]])
+                self.people[name].show(shown)
+                for follower in self.followers.get(name, ()):
+                    follower.show(shown)
         return None if self.client.ended and not frames else 1 / 60
 
     def set_cast(self, cast):
@@ -68,21 +71,45 @@ class Live:
             known = self.people.get(person["name"])
             if known is None or not np.allclose(known.told, person["offsets_m"]):
                 made = Person(
-                    person["name"], person["bones"], person["parents"], person["offsets_m"]
+                    person["name"],
+                    person["bones"],
+                    person["parents"],
+                    person["offsets_m"],
+                    person["height_m"],
                 )
                 made.told = np.array(person["offsets_m"])
                 self.people[person["name"]] = made
+                self.followers[person["name"]] = [
+                    Follower(each.object, made.names, made.rest, each.by_hand)
+                    for each in self.followers.get(person["name"], ())
+                ]
+
+    def follow(self, armature, character, by_hand):
+        """Puts a character in the place of its follower of earlier."""
+        person = next(p for p in self.people.values() if p.object == armature)
+        follower = Follower(character, person.names, person.rest, by_hand)
+        for others in self.followers.values():
+            others[:] = [each for each in others if each.object != character]
+        self.followers.setdefault(person.name, []).append(follower)
+        return follower
+
+    def shows(self, armature):
+        return any(person.object == armature for person in self.people.values())
+
+    def _poses(self, name, places, turns):
+        return self.people[name].poses(np.array(places), np.array(turns))
 
     def bake(self):
         """What was recorded as actions; the number of people."""
         for name, frames in self.recorded.items():
             times = np.array([time for time, _, _ in frames])
             kept = np.concatenate([[True], np.diff(times) > 0])
-            self.people[name].bake(
-                1 + (times[kept] - times[0]) * scene_rate_hz(),
-                np.array([place for _, place, _ in frames])[kept],
-                np.array([turn for _, _, turn in frames])[kept],
-            )
+            at = 1 + (times[kept] - times[0]) * scene_rate_hz()
+            _, places, turns = (list(column) for column in zip(*frames, strict=True))
+            poses = self._poses(name, places, turns)[kept]
+            self.people[name].bake(at, poses)
+            for follower in self.followers.get(name, ()):
+                follower.bake(at, poses, f"{name} on {follower.object.name}")
         count, self.recorded = len(self.recorded), {}
         return count
 
@@ -142,6 +169,61 @@ class SCENE_OT_fusecap_disconnect(bpy.types.Operator):
         return {"FINISHED"}
 
 
+class OBJECT_OT_fusecap_retarget(bpy.types.Operator):
+    """Put a person's motion onto the active armature: select the person, then the character"""
+
+    bl_idname = "object.fusecap_retarget"
+    bl_label = "Retarget to active"
+    bl_options = {"REGISTER", "UNDO"}
+    bones: StringProperty(
+        name="Bones", description="Where names are not guessed: left_thigh=Bone_17, ..."
+    )
+
+    @classmethod
+    def poll(cls, context):
+        return _person_and_character(context) is not None
+
+    def execute(self, context):
+        person, character = _person_and_character(context)
+        context.view_layer.update()  # else what was moved a moment ago stands where it was
+        try:
+            by_hand = _pairs(self.bones)
+            if _live is not None and _live.shows(person):
+                follower = _live.follow(person, character, by_hand)
+            else:
+                frames, names, rest, pose = baked_motion(person)
+                follower = Follower(character, names, rest, by_hand)
+                follower.bake(frames, pose, f"{person.name} on {character.name}")
+        except ValueError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        if follower.held:
+            held = ", ".join(follower.held)
+            self.report({"WARNING"}, f"constraints hold {held}: mute them, or take another rig")
+        pairs = ", ".join(f"{b} {follower.names[n]}" for b, n in follower.bones.items())
+        self.report({"INFO"}, f"{person.name}, scaled by {follower.scale:.3f}: {pairs}")
+        return {"FINISHED"}
+
+
+def _person_and_character(context):
+    """The other selected armature and the active one."""
+    others = [o for o in context.selected_objects if o.type == "ARMATURE" and o != context.object]
+    active = context.object
+    if active is None or active.type != "ARMATURE" or len(others) != 1:
+        return None
+    return others[0], active
+
+
+def _pairs(text):
+    pairs = {}
+    for part in filter(None, (piece.strip() for piece in text.split(","))):
+        bone, equals, name = part.partition("=")
+        if not (bone and equals and name):
+            raise ValueError(f"'{part}': expected BONE=NAME")
+        pairs[bone.strip()] = name.strip()
+    return pairs
+
+
 class VIEW3D_PT_fusecap(bpy.types.Panel):
     bl_label = "fusecap"
     bl_space_type = "VIEW_3D"
@@ -155,6 +237,7 @@ class VIEW3D_PT_fusecap(bpy.types.Panel):
         layout.prop(context.scene, "fusecap_record")
         layout.operator(SCENE_OT_fusecap_connect.bl_idname)
         layout.operator(SCENE_OT_fusecap_disconnect.bl_idname)
+        layout.operator(OBJECT_OT_fusecap_retarget.bl_idname)
 
 
 def _menu(self, _):
@@ -165,6 +248,7 @@ _CLASSES = (
     IMPORT_OT_fusecap_take,
     SCENE_OT_fusecap_connect,
     SCENE_OT_fusecap_disconnect,
+    OBJECT_OT_fusecap_retarget,
     VIEW3D_PT_fusecap,
 )
 

@@ -14,6 +14,10 @@ _MAIN_CHILD = {"hips": "spine", "spine3": "neck"}
 _SHORT_M = 0.08
 
 
+_TOE_HEIGHT = 0.012
+"""Of the joints of toes over the floor, as a share of the stature."""
+
+
 def connected(bones, parents, offsets_m):
     """The tree with the bones that tie limbs to the trunk.
 
@@ -49,16 +53,16 @@ def connected(bones, parents, offsets_m):
 class Person:
     """An armature object and how it is posed."""
 
-    def __init__(self, name, bones, parents, offsets_m):
+    def __init__(self, name, bones, parents, offsets_m, height_m):
         self.name = name
+        self._sole_m = _TOE_HEIGHT * height_m
         self.names, self.parents, self.offsets_m, self._turns = connected(
             list(bones), list(parents), offsets_m
         )
         self._of_bone = {n: i for i, n in enumerate(bones)}
         self.object = self._build()
-        self._rest = np.array(
-            [np.array(self.object.data.bones[n].matrix_local) for n in self.names]
-        )
+        self.rest = np.array([np.array(self.object.data.bones[n].matrix_local) for n in self.names])
+        """In the world (J, 4, 4): standing on the floor."""
 
     def _build(self):
         heads = np.zeros((len(self.names), 3))
@@ -66,6 +70,7 @@ class Person:
             if parent >= 0:
                 heads[bone] = heads[parent] + self.offsets_m[bone]
         heads = heads @ BLENDER_FROM_FUSECAP.T
+        heads[:, 2] += self._sole_m - heads[:, 2].min()
         data = bpy.data.armatures.new(self.name)
         made = bpy.data.objects.new(self.name, data)
         bpy.context.scene.collection.objects.link(made)
@@ -96,51 +101,61 @@ class Person:
             along = Vector((0, 0, 1))
         return Vector(heads[bone]) + along.normalized() * _SHORT_M
 
-    def channels(self, position_m, rotation_wxyz):
-        """Locations (T, B, 3) and quaternions (T, B, 4) of pose bones for T frames."""
+    def poses(self, position_m, rotation_wxyz):
+        """Matrices of pose bones (T, J, 4, 4) in the world."""
         position_m = np.asarray(position_m, dtype=float) @ BLENDER_FROM_FUSECAP.T
-        turn = _matrices(np.asarray(rotation_wxyz, dtype=float))
+        turn = matrices(np.asarray(rotation_wxyz, dtype=float))
         turn = BLENDER_FROM_FUSECAP @ turn @ BLENDER_FROM_FUSECAP.T
-        frames = len(position_m)
-        pose = np.tile(np.eye(4), (frames, len(self.names), 1, 1))
+        pose = np.tile(np.eye(4), (len(position_m), len(self.names), 1, 1))
         for bone, (name, with_bone) in enumerate(zip(self.names, self._turns, strict=True)):
-            pose[:, bone, :3, :3] = turn[:, with_bone] @ self._rest[bone, :3, :3]
+            pose[:, bone, :3, :3] = turn[:, with_bone] @ self.rest[bone, :3, :3]
             if name in self._of_bone:
                 pose[:, bone, :3, 3] = position_m[:, self._of_bone[name]]
             else:
                 start = turn[:, with_bone] @ (BLENDER_FROM_FUSECAP @ self.offsets_m[bone])
                 pose[:, bone, :3, 3] = position_m[:, with_bone] + start
-        places = np.empty((frames, len(self.names), 3))
-        quaternions = np.empty((frames, len(self.names), 4))
+        return pose
+
+    def channels(self, pose):
+        """Locations (T, J, 3) and quaternions (T, J, 4) of pose bones."""
+        places = np.empty((*pose.shape[:2], 3))
+        wxyz = np.empty((*pose.shape[:2], 4))
         for bone, parent in enumerate(self.parents):
-            basis = np.linalg.inv(self._rest[bone])
+            basis = np.linalg.inv(self.rest[bone])
             if parent >= 0:
-                basis = basis @ self._rest[parent] @ np.linalg.inv(pose[:, parent])
+                basis = basis @ self.rest[parent] @ np.linalg.inv(pose[:, parent])
             basis = basis @ pose[:, bone]
             places[:, bone] = basis[:, :3, 3]
-            quaternions[:, bone] = _quaternions(basis[:, :3, :3])
-        return places, quaternions
+            wxyz[:, bone] = quaternions(basis[:, :3, :3])
+        return places, wxyz
 
-    def show(self, position_m, rotation_wxyz):
-        """One frame, at once."""
-        places, quaternions = self.channels(position_m[None], rotation_wxyz[None])
+    def show(self, pose):
+        """One frame (1, J, 4, 4), at once."""
+        places, wxyz = self.channels(pose)
         for bone, name in enumerate(self.names):
             posed = self.object.pose.bones[name]
             posed.location = places[0, bone]
-            posed.rotation_quaternion = quaternions[0, bone]
+            posed.rotation_quaternion = wxyz[0, bone]
 
-    def bake(self, frames, position_m, rotation_wxyz):
+    def bake(self, frames, pose):
         """An action with a key for each of `frames` (T,)."""
-        places, quaternions = self.channels(position_m, rotation_wxyz)
-        curves = _new_curves(self.object, f"{self.name} take")
+        places, wxyz = self.channels(pose)
+        told = {}
         for bone, name in enumerate(self.names):
-            path = f'pose.bones["{bpy.utils.escape_identifier(name)}"]'
-            moves = np.abs(places[:, bone]).max() > 1e-5
-            for axis in range(3 if moves else 0):
-                _fill(curves.new(f"{path}.location", index=axis), frames, places[:, bone, axis])
-            for axis in range(4):
-                curve = curves.new(f"{path}.rotation_quaternion", index=axis)
-                _fill(curve, frames, quaternions[:, bone, axis])
+            told[name] = {"rotation_quaternion": wxyz[:, bone]}
+            if np.abs(places[:, bone]).max() > 1e-5:
+                told[name]["location"] = places[:, bone]
+        bake_channels(self.object, f"{self.name} take", frames, told)
+
+
+def bake_channels(owner, label, frames, told):
+    """A new action on an armature: values (T, 3 or 4) by channels by names of pose bones."""
+    curves = _new_curves(owner, label)
+    for name, channels in told.items():
+        path = f'pose.bones["{bpy.utils.escape_identifier(name)}"]'
+        for channel, values in channels.items():
+            for axis, column in enumerate(values.T):
+                _fill(curves.new(f"{path}.{channel}", index=axis), frames, column)
 
 
 def _new_curves(owner, name):
@@ -164,7 +179,8 @@ def _fill(curve, frames, values):
     curve.update()
 
 
-def _matrices(wxyz):
+def matrices(wxyz):
+    """Rotations (..., 3, 3) of quaternions (..., 4)."""
     w, x, y, z = np.moveaxis(wxyz / np.linalg.norm(wxyz, axis=-1, keepdims=True), -1, 0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -174,11 +190,11 @@ def _matrices(wxyz):
     return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
 
 
-def _quaternions(matrices):
+def quaternions(turns):
     """w, x, y, z; neighbours are near, so that curves do not jump."""
     from mathutils import Matrix
 
-    found = np.array([tuple(Matrix(m.tolist()).to_quaternion()) for m in matrices])
+    found = np.array([tuple(Matrix(m.tolist()).to_quaternion()) for m in turns])
     flips = np.einsum("ti,ti->t", found[1:], found[:-1]) < 0
     signs = np.where(np.logical_xor.accumulate(np.concatenate([[False], flips])), -1.0, 1.0)
     return found * signs[:, None]

@@ -17,12 +17,18 @@ def import_take(path, rate_hz):
         tracked = take["tracked"][row]
         if tracked.any():
             person = Person(
-                name, take["bone_names"].tolist(), take["parents"].tolist(), take["offsets_m"][row]
+                name,
+                take["bone_names"].tolist(),
+                take["parents"].tolist(),
+                take["offsets_m"][row],
+                float(take["heights_m"][row]),
             )
             person.bake(
                 1 + time_s[tracked] * rate_hz,
-                take["bone_position_in_world_m"][row, tracked],
-                take["bone_rotation_in_world_wxyz"][row, tracked],
+                person.poses(
+                    take["bone_position_in_world_m"][row, tracked],
+                    take["bone_rotation_in_world_wxyz"][row, tracked],
+                ),
             )
             people.append(person)
     if not people:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import copy
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 from fusecap.errors import InputError
 from fusecap.exports.blender import fbx_from_glb, run_in_blender
 from fusecap.exports.characters.bone_names import BoneMap, bone_map
+from fusecap.exports.characters.bone_words import spine_shares
 from fusecap.exports.characters.character import Character, read_character
 from fusecap.exports.gltf import Gltf
 from fusecap.exports.library import written_by_name
@@ -42,7 +43,6 @@ _CHILD = {
     )
 }
 """Limbs whose direction at rest is compared, and where they end."""
-_SPINE = ("spine", "spine1", "spine2", "spine3")
 _FROM_FBX = """
 bpy.ops.wm.read_factory_settings(use_empty=True)
 bpy.ops.import_scene.fbx(filepath=told["fbx"])
@@ -174,7 +174,7 @@ class _Moved:
         for side in ("left", "right"):
             laid[f"{side}_hand"] = laid.get(f"{side}_forearm", np.eye(3))
         followed = {node: (bone, bone, 0.0) for bone, node in self._bones.items()}
-        followed |= _spine_followed(mapped.spine)
+        followed |= dict(zip(mapped.spine, spine_shares(len(mapped.spine)), strict=True))
         for node, (one, other, share) in followed.items():
             turn = self._ours[one]
             if share:
@@ -251,23 +251,6 @@ def _legs_m(place: Mapping[str, np.ndarray], character: Character) -> dict[str, 
     if min(lengths.values()) < 1e-4:
         raise InputError(f"{character.path}: its legs have no length at rest")
     return lengths
-
-
-def _spine_followed(spine: Sequence[int]) -> dict[int, tuple[str, str, float]]:
-    """Per node of a spine two neighbours of ours, and how far it turns from one to the other.
-
-    The lowest of n turns as ours does at 1/n of the way up, the highest as our highest.
-    """
-    followed = {}
-    for index, node in enumerate(spine):
-        at = 4 * (index + 1) / len(spine)
-        low = min(int(at), 3)
-        share = at - low
-        if low == 0:
-            followed[node] = ("spine", "spine", 0.0)
-        else:
-            followed[node] = (_SPINE[low - 1], _SPINE[low], share)
-    return followed
 
 
 def _write(character: Character, moved: _Moved, motion: RigMotion, path: Path) -> None:
