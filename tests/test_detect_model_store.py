@@ -143,7 +143,7 @@ def test_unknown_checksum_is_recorded_and_a_later_change_noticed(server, network
     assert left_behind(cache) == ["tiny.onnx", "tiny.onnx.sha256"]
     model_path("tiny", models=store(server), cache=cache)
     path.write_bytes(network + b"x")
-    with pytest.raises(InputError, match="delete the file and it is downloaded again"):
+    with pytest.raises(InputError, match="delete the file, then fetch or import it again"):
         model_path("tiny", models=store(server), cache=cache)
 
 
@@ -226,6 +226,10 @@ def test_paths_and_names(tmp_path, network):
 def test_known_networks_are_whole():
     assert {DEFAULT_MODEL, DEFAULT_PERSON_MODEL} <= set(MODELS)
     for name, model in MODELS.items():
+        assert (model.url is None) == bool(model.package), name
+        if model.url is None:
+            assert model.sha256 and model.suffix == ".tflite", name
+            continue
         url = urlparse(model.url)
         assert url.scheme == "https" and url.path.endswith(".zip"), name
         assert "{" not in model.url and model.member == "end2end.onnx"

@@ -82,9 +82,9 @@ BOARD = InputKind(what="a board (board.toml)", most_bytes=4 * _MB, error=Calibra
 MOTION = InputKind(what="a motion file", most_bytes=256 * _MB)
 MADE_FILES = InputKind(what="a list of files made from a take", most_bytes=4 * _MB)
 CHARACTER = InputKind(what="a character (.glb, .vrm)", most_bytes=1024 * _MB)
-NETWORK = InputKind(what="a network (.onnx or OpenVINO .xml)", most_bytes=2048 * _MB)
+NETWORK = InputKind(what="a network (.onnx, .xml, .tflite)", most_bytes=2048 * _MB)
 DATASET = InputKind(what="a file of a data set", most_bytes=2048 * _MB)
-ARCHIVE = InputKind(what="a tar archive", most_bytes=None)
+ARCHIVE = InputKind(what="an archive", most_bytes=None)
 CELL = InputKind(what="a cell of an experiment", most_bytes=64 * _MB)
 
 KINDS = (

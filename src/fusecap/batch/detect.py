@@ -208,7 +208,7 @@ def detect_videos(
     return Detected(
         detector=detector.identity,
         landmark_set=detector.landmarks.name,
-        cameras={work.camera.name: work.summary(detector.landmarks) for work in works},
+        cameras={work.camera.name: work.summary() for work in works},
         frames_detected=sum(work.written for work in works),
         frames_per_s=looked_at / loop_s if looked_at else float("nan"),
         elapsed_s=time.perf_counter() - started,
@@ -328,7 +328,7 @@ class _Work:
         self.written = 0
         self.looked_at = 0
         """Frames, those written included."""
-        self._landmark_count = len(detector.landmarks.landmark_names)
+        self._landmarks = detector.landmarks
         self._undecodable = 0
         self._record = DetectionRecord(
             landmark_set=detector.landmarks.name,
@@ -368,11 +368,12 @@ class _Work:
     def keep(self, number: int, people: np.ndarray | None, decoded: bool) -> np.ndarray:
         """Writes a frame that has no file, that of a picture which cannot be decoded as empty."""
         if people is None or not decoded:
-            people = np.empty((0, self._landmark_count, 3))
+            people = np.empty((0, len(self._landmarks.landmark_names), 3))
         self.looked_at += 1
         if not self.done[number]:
             self._undecodable += not decoded
-            openpose.write_frame(self.camera.folder, self.camera.name, number, people)
+            everything = self._landmarks.with_all(people)
+            openpose.write_frame(self.camera.folder, self.camera.name, number, everything)
             self.done[number] = True
             self.written += 1
         return people
@@ -390,18 +391,19 @@ class _Work:
             )
         return notes
 
-    def summary(self, landmarks: LandmarkSet) -> CameraSummary:
+    def summary(self) -> CameraSummary:
         frames = int(self.done.sum())
         people: tuple[np.ndarray, ...] = ()
         if frames:
             people = read_keypoints(
                 self.camera.folder,
                 name=self.camera.name,
-                landmarks=landmarks,
+                landmarks=self._landmarks,
                 rate_hz=self.camera.video.info.rate_hz,
             ).people
         counts = np.array([len(some) for some in people])
-        everyone = np.concatenate([np.empty((0, self._landmark_count, 3)), *people])
+        nobody = np.empty((0, len(self._landmarks.landmark_names), 3))
+        everyone = np.concatenate([nobody, *people])
         found = everyone[:, :, 2][everyone[:, :, 2] > 0]
         return CameraSummary(
             frames=frames,

@@ -104,6 +104,13 @@ class LandmarkSet:
             return people[:, : len(self.landmark_names)]
         return people[:, list(self.columns)]
 
+    def with_all(self, people: Float[np.ndarray, "n k 3"]) -> Float[np.ndarray, "n m 3"]:
+        """As many keypoints as in a file, those that are no landmarks missing."""
+        columns = self.columns or range(len(self.landmark_names))
+        everything = np.full((len(people), self.keypoint_count, 3), (np.nan, np.nan, 0.0))
+        everything[:, list(columns)] = people
+        return everything
+
     def index(self, name: str) -> int | None:
         """Position of a landmark, or None where this detector does not have it."""
         return self.landmark_names.index(name) if name in self.landmark_names else None

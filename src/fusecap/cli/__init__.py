@@ -34,6 +34,7 @@ from fusecap.cli import (
     export,
     init,
     live,
+    models,
     overlay,
     report,
     retarget,
@@ -60,6 +61,8 @@ calibrate = typer.Typer(
 app.add_typer(calibrate, name="calibrate")
 evaluate = typer.Typer(no_args_is_help=True, help="The paper's tables and figures.")
 app.add_typer(evaluate, name="evaluate")
+networks = typer.Typer(no_args_is_help=True, help="Networks that find people: list, fetch, import.")
+app.add_typer(networks, name="models")
 
 
 def _print_version(asked: bool) -> None:
@@ -101,6 +104,9 @@ calibrate.command(epilog=calibrate_imu.EXAMPLE)(calibrate_imu.imu)
 calibrate.command(epilog=calibrate_shape.EXAMPLE)(calibrate_shape.shape)
 calibrate.command(epilog=calibrate_offsets.EXAMPLE)(calibrate_offsets.offsets)
 calibrate.command(epilog=calibrate_prior.EXAMPLE)(calibrate_prior.prior)
+networks.command("list", epilog=models.LIST_EXAMPLE)(models.list_models)
+networks.command("fetch", epilog=models.FETCH_EXAMPLE)(models.fetch_models)
+networks.command("import", epilog=models.IMPORT_EXAMPLE)(models.import_packages)
 evaluate_twin.add_to(evaluate)
 evaluate_datasets.add_to(evaluate)
 

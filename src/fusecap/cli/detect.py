@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fusecap.cli.common import Json, check_choice, print_json
+from fusecap.cli.models import ask_for_networks
 from fusecap.cli.terminal import console, err, note, progress, remark, table_of, wrote
 from fusecap.errors import InputError
 
@@ -84,6 +85,7 @@ def detect(
     else:
         videos = _videos(recording)
         cameras = loose_videos(videos, out or videos[0].parent / "keypoints")
+    ask_for_networks(options, quiet=as_json)
     with progress(quiet=as_json, rate=True) as show:
         detector = build_detector(options, show)
         setup = video_setup(session, cameras, detector.landmarks) if session else None
@@ -118,8 +120,10 @@ def detect_missing(session: Session, *, quiet: bool) -> Detected | None:
     cameras = session_videos(session, undetected=True)
     if not cameras:
         return None
+    options = detector_options(session)
+    ask_for_networks(options, quiet=quiet)
     with progress(quiet=quiet, rate=True) as show:
-        detector = build_detector(detector_options(session), show)
+        detector = build_detector(options, show)
         setup = video_setup(session, cameras, detector.landmarks)
         found = detect_videos(cameras, detector, setup=setup, progress=show)
     _warn(found)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fusecap.cli.common import Json, SessionPath, check_choice, print_json
+from fusecap.cli.models import ask_for_networks
 from fusecap.cli.targets import TO_HELP, placed_targets, warn_if_open
 from fusecap.cli.terminal import console, err, note, progress
 from fusecap.errors import InputError
@@ -115,7 +116,7 @@ def live(
     """
     from fusecap.cli.live_status import LiveLine, print_report
     from fusecap.live.devices.source import SessionClock
-    from fusecap.live.opening import check_live, open_setup, open_sources
+    from fusecap.live.opening import check_live, networks_of, open_setup, open_sources
     from fusecap.live.recorder import RecordSwitch
     from fusecap.live.run import LiveOptions, LiveRun
     from fusecap.recording.layout import SUFFIX
@@ -142,6 +143,8 @@ def live(
         stalls=stall or [],
     )
     missing = [] if played else check_live(loaded)
+    if (networks := networks_of(loaded, playback=playback)) is not None:
+        ask_for_networks(networks, quiet=as_json)
     with progress(quiet=as_json) as show:
         setup, detector = open_setup(loaded, playback=playback, progress=show)
         clock = SessionClock()

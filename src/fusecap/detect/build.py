@@ -3,6 +3,12 @@
 from __future__ import annotations
 
 from fusecap.body.landmarks import LandmarkSet
+from fusecap.detect.blazepose import (
+    BlazePersonDetector,
+    BlazePose,
+    finds_keypoints,
+    finds_people,
+)
 from fusecap.detect.detector import Detector, DetectorOptions
 from fusecap.detect.model_store import model_path
 from fusecap.detect.one_stage import OneStageDetector, is_one_stage
@@ -36,9 +42,17 @@ def build_detector(
     if is_one_stage(network):
         detector = OneStageDetector(network, landmarks)
         return PackedDetector(detector) if options.packed else detector
-    pose = PoseNetwork(network, landmarks)
-    person = PersonDetector(_load(options.person_model, options.runtime, progress, threads))
-    finder = PackedPersonDetector(person) if options.packed else person
+    pose = BlazePose(network) if finds_keypoints(network) else PoseNetwork(network, landmarks)
+    boxes = _load(options.person_model, options.runtime, progress, threads)
+    if not finds_people(boxes):
+        person = PersonDetector(boxes)
+        finder = PackedPersonDetector(person) if options.packed else person
+    elif options.packed:
+        raise InputError(
+            f"{boxes.path}: finds who is near, and in a mosaic everybody is far; leave out packed"
+        )
+    else:
+        finder = BlazePersonDetector(boxes)
     return TopDownDetector(finder, pose, options.person_every, follow_others=follow_others)
 
 

@@ -1,12 +1,15 @@
-"""Networks by name: downloaded once, checked, kept in the user's cache.
+"""Networks by name: downloaded once or taken out of a package, checked, kept in the user's cache.
 
 The files are OpenMMLab's exports for deployment, zip archives with one `end2end.onnx` each, at the
 addresses that Tau-J/rtmlib and open-mmlab/mmpose list. A checksum is of that .onnx file. Where it
 is None, no trustworthy record of it was at hand: then whatever came first is recorded beside the
 file, so a later change is noticed, but the first download is only as good as its HTTPS connection.
 
-The weights are Apache-2.0, but were trained on data sets of which some allow research only; whether
-that binds who uses the weights is for the user to judge.
+BlazePose's networks have no address of their own: packages of registries hold them, and
+`fusecap models import` takes them out (`fusecap.detect.model_import`).
+
+The weights are Apache-2.0, but OpenMMLab's were trained on data sets of which some allow research
+only; whether that binds who uses the weights is for the user to judge.
 """
 
 from __future__ import annotations
@@ -25,6 +28,7 @@ from http.client import HTTPException
 from pathlib import Path
 from typing import BinaryIO
 
+from fusecap.detect.runtimes.choice import SUFFIXES
 from fusecap.errors import InputError, nearest
 from fusecap.inputs import NETWORK, SETTINGS, open_input, read_text
 from fusecap.progress import Progress
@@ -39,20 +43,45 @@ _CHUNK = 1 << 18
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredModel:
-    """A network that can be fetched."""
+    """A network that can be fetched, or imported from a package."""
 
-    url: str
+    url: str | None
+    """None: it comes inside a package only."""
     sha256: str | None
     """Of the network's file, after unpacking; None: unknown."""
     member: str | None = "end2end.onnx"
     """Name of the file inside a zip archive, in whatever folder; None: `url` is the file itself."""
     about: str = ""
+    licence: str = "Apache-2.0; some data sets it was trained on allow research only"
+    package: str = ""
+    """What brings a package that holds it."""
+    whole_images: bool = False
+    """It needs no person detector."""
+
+    @property
+    def suffix(self) -> str:
+        """Of the file."""
+        return Path(self.member or self.url or "").suffix or ".onnx"
 
 
 _OPENMMLAB = "https://download.openmmlab.com/mmpose/v1/projects"
 _HALPE = f"{_OPENMMLAB}/rtmposev1/onnx_sdk/rtmpose-{{}}_simcc-body7_pt-body7-halpe26_700e-{{}}.zip"
 _YOLOX = f"{_OPENMMLAB}/rtmposev1/onnx_sdk/yolox_{{}}_8xb8-300e_humanart-{{}}.zip"
 _RTMO = f"{_OPENMMLAB}/rtmo/onnx_sdk/rtmo-{{}}-600e_body7-640x640-{{}}.zip"
+_WHEEL = "pip download --no-deps --python-version 3.11 --only-binary :all: mediapipe==0.10.14"
+_NPM = "npm pack @mediapipe/pose@0.5.1675469404"
+
+
+def _blazepose(member: str, sha256: str, about: str, package: str) -> StoredModel:
+    return StoredModel(
+        url=None,
+        member=member,
+        sha256=sha256,
+        about=about,
+        licence="Apache-2.0",
+        package=package,
+    )
+
 
 MODELS: Mapping[str, StoredModel] = {
     "rtmpose-t-halpe26": StoredModel(
@@ -96,11 +125,37 @@ MODELS: Mapping[str, StoredModel] = {
         url=_RTMO.format("s_8xb32", "dac2bf74_20231211"),
         sha256=None,
         about="whole images, 17 keypoints, 640x640",
+        whole_images=True,
     ),
     "rtmo-m": StoredModel(
         url=_RTMO.format("m_16xb16", "39e78cc4_20231211"),
         sha256=None,
         about="whole images, 17 keypoints, 640x640, slower and better",
+        whole_images=True,
+    ),
+    "blazepose-lite": _blazepose(
+        "pose_landmark_lite.tflite",
+        "f17bfbecadb61c3be1baa8b8d851cc6619c870a87167b32848ad20db306b9d61",
+        "pose, 33 keypoints with heels and toes, 256x256, fastest",
+        _NPM,
+    ),
+    "blazepose-full": _blazepose(
+        "pose_landmark_full.tflite",
+        "e9a5c5cb17f736fafd4c2ec1da3b3d331d6edbe8a0d32395855aeb2cdfd64b9f",
+        "pose, 33 keypoints with heels and toes, 256x256",
+        _WHEEL,
+    ),
+    "blazepose-heavy": _blazepose(
+        "pose_landmark_heavy.tflite",
+        "59e42d71bcd44cbdbabc419f0ff76686595fd265419566bd4009ef703ea8e1fe",
+        "pose, 33 keypoints with heels and toes, 256x256, slowest and best",
+        _NPM,
+    ),
+    "blazepose-person": _blazepose(
+        "pose_detection.tflite",
+        "9ba9dd3d42efaaba86b4ff0122b06f29c4122e756b329d89dca1e297fd8f866c",
+        "people's boxes from their faces: a few metres away",
+        _WHEEL,
     ),
 }
 
@@ -114,10 +169,27 @@ def cache_dir() -> Path:
     return Path.home() / ".cache" / "fusecap" / "models"
 
 
+def kept_at(model: str, stored: StoredModel, cache: Path | None = None) -> Path:
+    """Where its file is or would be."""
+    return (cache_dir() if cache is None else cache) / f"{model}{stored.suffix}"
+
+
 def to_download(model: str) -> StoredModel | None:
     """What `model_path` would fetch; None where nothing needs fetching."""
     stored = MODELS.get(model)
-    return None if (cache_dir() / f"{model}.onnx").is_file() else stored
+    return None if stored is None or kept_at(model, stored).is_file() else stored
+
+
+def download_size(stored: StoredModel, timeout_s: float = TIMEOUT_S) -> int | None:
+    """Bytes that fetching it would bring; None where the server does not say."""
+    if stored.url is None:
+        return None
+    request = urllib.request.Request(stored.url, method="HEAD", headers={"User-Agent": "fusecap"})
+    try:
+        with urllib.request.urlopen(request, timeout=timeout_s) as reply:
+            return int(reply.headers.get("Content-Length") or 0) or None
+    except (OSError, HTTPException, ValueError):
+        return None
 
 
 def model_path(
@@ -136,30 +208,33 @@ def model_path(
         path = Path(model).expanduser()
         if path.is_file():
             return path
-        if path.suffix in (".onnx", ".xml") or len(path.parts) > 1:
+        if path.suffix in SUFFIXES or len(path.parts) > 1:
             raise InputError(
-                f"{model}: no such file; expected a network (.onnx or OpenVINO .xml) or one of "
+                f"{model}: no such file; expected a network ({', '.join(SUFFIXES)}) or one of "
                 f"{', '.join(models)}"
             )
         raise InputError(
-            f"no network '{model}'{nearest(model, models)}; the path of a .onnx or .xml works too"
+            f"no network '{model}'{nearest(model, models)}; the path of a file works too "
+            f"({', '.join(SUFFIXES)})"
         )
     stored = models[model]
-    path = (cache_dir() if cache is None else cache) / f"{model}.onnx"
+    path = kept_at(model, stored, cache)
     record = path.with_name(f"{path.name}.sha256")
     try:
         if not path.is_file():
-            _fetch(model, stored, path, record, progress, timeout_s)
+            if stored.url is None:
+                raise InputError(
+                    f"the network '{model}' is not on this machine; it comes inside a package: "
+                    f"{stored.package}; then fusecap models import FILE"
+                )
+            _fetch(model, stored, path, progress, timeout_s)
         elif (found := _sha256(path)) != (expected := _expected(stored, record, found)):
             raise InputError(
                 f"{path}: its SHA-256 is {found}, expected {expected}; "
-                "delete the file and it is downloaded again"
+                "delete the file, then fetch or import it again"
             )
     except OSError as error:
-        raise InputError(
-            f"{path}: cannot keep the network '{model}' there ({error.strerror or error}); "
-            "set FUSECAP_CACHE to a folder that can be written"
-        ) from error
+        raise _cannot_keep(model, path, error) from error
     return path
 
 
@@ -172,11 +247,45 @@ def _expected(stored: StoredModel, record: Path, found: str) -> str:
     return read_text(record, SETTINGS, strict=False).strip()
 
 
+def keep(
+    name: str, stored: StoredModel, source: io.BufferedIOBase, cache: Path | None = None
+) -> None:
+    """Keep a network's file that came from elsewhere; raises `InputError` for a wrong one."""
+    path = kept_at(name, stored, cache)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with _part(path, "network") as network:
+            with network.open("wb") as file:
+                shutil.copyfileobj(source, file, _CHUNK)
+            _take(name, stored, network, path, "get its package again")
+    except OSError as error:
+        raise _cannot_keep(name, path, error) from error
+
+
+def _take(name: str, stored: StoredModel, network: Path, path: Path, remedy: str) -> None:
+    """Checks a network's file and gives it its place."""
+    found = _sha256(network)
+    if stored.sha256 is not None and found != stored.sha256:
+        raise InputError(
+            f"the SHA-256 of '{name}' is {found}, expected {stored.sha256}; nothing was kept; "
+            f"{remedy}"
+        )
+    if stored.sha256 is None:
+        _write_record(path.with_name(f"{path.name}.sha256"), found)
+    network.replace(path)
+
+
+def _cannot_keep(name: str, path: Path, error: OSError) -> InputError:
+    return InputError(
+        f"{path}: cannot keep the network '{name}' there ({error.strerror or error}); "
+        "set FUSECAP_CACHE to a folder that can be written"
+    )
+
+
 def _fetch(
     name: str,
     stored: StoredModel,
     path: Path,
-    record: Path,
     progress: Progress | None,
     timeout_s: float,
 ) -> None:
@@ -187,15 +296,7 @@ def _fetch(
             download.replace(network)
         else:
             _unpack(name, stored, download, network)
-        found = _sha256(network)
-        if stored.sha256 is not None and found != stored.sha256:
-            raise InputError(
-                f"{stored.url}: the SHA-256 of '{name}' is {found}, expected {stored.sha256}; "
-                f"nothing was kept; {_by_hand(stored, path)}"
-            )
-        if stored.sha256 is None:
-            _write_record(record, found)
-        network.replace(path)
+        _take(name, stored, network, path, _by_hand(stored, path))
 
 
 @contextlib.contextmanager
@@ -216,6 +317,7 @@ def _download(
     progress: Progress | None,
     timeout_s: float,
 ) -> None:
+    assert stored.url is not None
     request = urllib.request.Request(stored.url, headers={"User-Agent": "fusecap"})
     try:
         with urllib.request.urlopen(request, timeout=timeout_s) as reply, part.open("wb") as file:
@@ -274,7 +376,7 @@ def _unpack(name: str, stored: StoredModel, archive: Path, network: Path) -> Non
 
 
 def _by_hand(stored: StoredModel, path: Path) -> str:
-    source = stored.url if stored.member is None else f"{stored.member} of {stored.url}"
+    source = f"{stored.url}" if stored.member is None else f"{stored.member} of {stored.url}"
     return f"put {source} at {path} by hand, or give the path of any network file instead"
 
 

@@ -43,14 +43,21 @@ def suppressed(
     boxes: Float[np.ndarray, "n 5"], least_score: float, most_overlap: float
 ) -> Float[np.ndarray, "m 5"]:
     """Non-maximum suppression: best first, no two that overlap by more than `most_overlap`."""
-    boxes = boxes[boxes[:, 4] >= least_score]
-    boxes = boxes[np.argsort(-boxes[:, 4], kind="stable")]
-    shared = overlaps(boxes[:, :4], boxes[:, :4])
+    return boxes[unsuppressed(boxes, least_score, most_overlap)]
+
+
+def unsuppressed(
+    boxes: Float[np.ndarray, "n 5"], least_score: float, most_overlap: float
+) -> Int[np.ndarray, " m"]:
+    """Which of the boxes `suppressed` keeps, in its order."""
+    good = np.flatnonzero(boxes[:, 4] >= least_score)
+    order = good[np.argsort(-boxes[good, 4], kind="stable")]
+    shared = overlaps(boxes[order, :4], boxes[order, :4])
     kept: list[int] = []
-    for i in range(len(boxes)):
+    for i in range(len(order)):
         if not kept or shared[i, kept].max() <= most_overlap:
             kept.append(i)
-    return boxes[kept]
+    return order[kept]
 
 
 def seen(people: Float[np.ndarray, "n k 3"]) -> Bool[np.ndarray, "n k"]:

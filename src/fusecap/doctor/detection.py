@@ -36,13 +36,16 @@ def _check_networks(options: DetectorOptions, findings: Findings) -> None:
     for model in dict.fromkeys((options.model, options.person_model)):
         try:
             stored = to_download(model)
-            if stored is not None:
+            if stored is not None and stored.url is None:
+                model_path(model)  # says where it comes from
+            elif stored is not None:
                 findings.add(
                     "info",
                     "detector",
                     f"the network '{model}' is not on this machine yet",
                     f"fusecap detect downloads it once, from {stored.url}",
                 )
-            runtime_for(f"{model}.onnx" if stored else model_path(model), options.runtime)
+            path = model_path(model) if stored is None else f"{model}{stored.suffix}"
+            runtime_for(path, options.runtime)
         except FusecapError as error:
             findings.add("error", "detector", str(error))

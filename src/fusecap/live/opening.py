@@ -6,7 +6,7 @@ import os
 
 from fusecap.batch.detect import detector_options
 from fusecap.detect.build import build_detector
-from fusecap.detect.detector import Detector
+from fusecap.detect.detector import Detector, DetectorOptions
 from fusecap.errors import SessionError
 from fusecap.live.devices.open_devices import device_sources
 from fusecap.live.devices.playback_sources import PlaybackOptions, playback_sources
@@ -25,13 +25,12 @@ def open_setup(
     One core is left to everything else. Raises `InputError`; where the session has nothing to
     open, or cameras that bring other keypoints than the detector, it says which.
     """
-    pictures = [camera for camera in session.cameras if _brings_pictures(camera, playback=playback)]
-    if not pictures:
+    options = networks_of(session, playback=playback)
+    if options is None:
         return session_setup(session), None
+    pictures = [camera for camera in session.cameras if _brings_pictures(camera, playback=playback)]
     threads = max(1, (os.cpu_count() or 1) - 1)
-    detector = build_detector(
-        detector_options(session), progress, threads=threads, follow_others=False
-    )
+    detector = build_detector(options, progress, threads=threads, follow_others=False)
     landmarks = detector.landmarks
     for camera in session.cameras:
         if camera not in pictures and camera.landmark_set_name != landmarks.name:
@@ -41,6 +40,12 @@ def open_setup(
                 "none"
             )
     return session_setup(session, landmarks), detector
+
+
+def networks_of(session: Session, *, playback: bool) -> DetectorOptions | None:
+    """What the run detects with; None where no camera brings pictures."""
+    pictures = (_brings_pictures(camera, playback=playback) for camera in session.cameras)
+    return detector_options(session) if any(pictures) else None
 
 
 def open_sources(

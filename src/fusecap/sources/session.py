@@ -33,7 +33,7 @@ from fusecap.sources.live_address import parse_camera_address, parse_imu_address
 
 FILE_NAME = "session.toml"
 KEYPOINT_FORMATS = tuple(f"openpose-{name}" for name in LANDMARK_SETS)
-MODEL_SUFFIXES = (".onnx", ".xml")
+MODEL_SUFFIXES = (".onnx", ".xml", ".tflite")
 """Of network files; anything else is a name."""
 
 

@@ -10,13 +10,15 @@ from fusecap.errors import InputError, from_extra, nearest
 from fusecap.inputs import NETWORK, check_input
 
 RUNTIMES = ("auto", "onnxruntime", "openvino")
+SUFFIXES = (".onnx", ".xml", ".tflite")
+"""Of networks: ONNX, OpenVINO's, TensorFlow Lite's."""
 
 
 def open_network(path: Path, runtime: str = "auto", threads: int | None = None) -> Network:
     """Load a network; `threads` None: as many as there are cores.
 
-    "auto" takes .xml to OpenVINO and .onnx to ONNX Runtime, or to OpenVINO where that alone is
-    installed. Raises `InputError` for a missing or broken file and where the runtime is missing.
+    "auto" takes .onnx to ONNX Runtime, or to OpenVINO where that alone is installed; all else to
+    OpenVINO. Raises `InputError` for a missing or broken file and where the runtime is missing.
     """
     check_input(path, NETWORK)
     if runtime_for(path, runtime) == "onnxruntime":
@@ -32,13 +34,15 @@ def runtime_for(path: Path | str, runtime: str = "auto") -> str:
     if runtime not in RUNTIMES:
         raise InputError(f"no runtime '{runtime}'{nearest(runtime, RUNTIMES)}")
     path = Path(path)
-    if path.suffix not in (".onnx", ".xml"):
-        raise InputError(f"{path}: expected a network, .onnx or OpenVINO .xml")
-    if path.suffix == ".xml" and runtime == "onnxruntime":
-        raise InputError(f"{path}: ONNX Runtime cannot read OpenVINO files; set runtime openvino")
+    if path.suffix not in SUFFIXES:
+        raise InputError(f"{path}: expected a network: {', '.join(SUFFIXES)}")
+    if path.suffix != ".onnx" and runtime == "onnxruntime":
+        raise InputError(
+            f"{path}: ONNX Runtime cannot read {path.suffix} files; set runtime openvino"
+        )
     if runtime == "auto":
         by_openvino = openvino.installed() and not onnxruntime.installed()
-        runtime = "openvino" if path.suffix == ".xml" or by_openvino else "onnxruntime"
+        runtime = "openvino" if path.suffix != ".onnx" or by_openvino else "onnxruntime"
     if runtime == "onnxruntime" and not onnxruntime.installed():
         raise InputError(
             f"{path.name} needs ONNX Runtime, which is not installed; {from_extra('detect')}"

@@ -1,4 +1,4 @@
-"""OpenVINO IR and ONNX files by OpenVINO on the processor."""
+"""OpenVINO IR, ONNX and TensorFlow Lite files by OpenVINO on the processor."""
 
 from __future__ import annotations
 
@@ -41,6 +41,8 @@ class OpenVinoNetwork:
         core: Any = openvino.Core()
         try:
             model = core.read_model(path)
+            if path.suffix == ".tflite":
+                model = _channels_first(model)
             inputs = model.inputs
             if len(inputs) != 1 or inputs[0].get_partial_shape().rank.get_length() != 4:
                 raise InputError(f"{path}: expected one image input (n, 3, h, w)")
@@ -84,6 +86,19 @@ class OpenVinoNetwork:
             tensor.name: request.get_output_tensor(i).data.copy()
             for i, tensor in enumerate(self.outputs)
         }
+
+
+def _channels_first(model: Any) -> Any:
+    """A network as others are, from one whose pictures have channels last; masks are cut off."""
+    import openvino
+
+    steps: Any = openvino.preprocess.PrePostProcessor(model)
+    steps.input().tensor().set_layout(openvino.Layout("NCHW"))
+    steps.input().model().set_layout(openvino.Layout("NHWC"))
+    turned = steps.build()
+    kept = [one for one in turned.outputs if one.get_partial_shape().rank.get_length() < 4]
+    make: Any = openvino.Model
+    return make(kept, turned.get_parameters()) if kept else turned
 
 
 def _free_batch(model: Any) -> None:
