@@ -691,3 +691,34 @@ def test_fbx_is_read_as_it_was_written():
         FbxFile.read(data[:23] + struct.pack("<I", 7700) + data[27:])
     with pytest.raises(InputError, match="unknown type b'Q'"):
         FbxFile.read(data.replace(b"L\x07\0", b"Q\x07\0"))
+
+
+def test_who_is_not_tracked_is_not_seen_in_glb_and_usd(tmp_path):
+    take = with_gap(two_walkers(10), [0, 4, 5])
+    (path,) = export_take(take, tmp_path, format="glb", stem="t")
+    tree, values = gltf_arrays(path)
+    sizes = [c for c in tree.animations[0].channels if c.target.path == "scale"]
+    assert [tree.nodes[channel.target.node].name for channel in sizes] == ["anna"]
+    sampler = tree.animations[0].samplers[sizes[0].sampler]
+    assert sampler.interpolation == "STEP"
+    assert values(sampler.input).ravel() == pytest.approx(take.time_s[[0, 1, 4, 6]], abs=1e-6)
+    assert values(sampler.output)[:, 0].tolist() == [0, 1, 0, 1]
+    usd = pytest.importorskip("pxr.Usd")
+    (path,) = export_take(take, tmp_path, format="usd", stem="t")
+    stage = usd.Stage.Open(str(path))
+    for row, name in enumerate(take.subject_names):
+        shown = stage.GetPrimAtPath(f"/Take/{name}").GetAttribute("visibility")
+        words = [shown.Get(frame) or "inherited" for frame in range(10)]
+        assert [word == "inherited" for word in words] == take.tracked[row].tolist()
+
+
+def test_where_a_format_holds_the_last_pose_is_told(tmp_path):
+    save_take(with_gap(two_walkers(60), [0, 1, 10, 20, 21, 30, 40]), tmp_path / "t.npz")
+    command = ["export", str(tmp_path / "t.npz"), "--format", "bvh,vrma,glb", "--json"]
+    told = json.loads(CliRunner().invoke(app, command).stdout)
+    assert told["notes"] == [
+        "'anna' is not tracked in 7 frames (0.00-0.02, 0.17-0.17, 0.33-0.35 s and 2 more): "
+        ".bvh, .vrma hold the last pose there"
+    ]
+    command = ["export", str(tmp_path / "t.npz"), "--format", "usd,glb"]
+    assert "not tracked" not in CliRunner().invoke(app, command).output

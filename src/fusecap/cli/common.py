@@ -110,7 +110,7 @@ def write_take(solved: Solved, path: Path, exports: Exports, *, picture: bool) -
     take stays.
     """
     from fusecap.exports.made_files import list_made
-    from fusecap.exports.take_files import plan_files
+    from fusecap.exports.take_files import held_poses, plan_files
     from fusecap.take import save_take
 
     told = solved.report.as_json()
@@ -142,6 +142,8 @@ def write_take(solved: Solved, path: Path, exports: Exports, *, picture: bool) -
             files.append(image)
     finally:
         set_aside_earlier(path, files)
+    for text in held_poses(take, planned):
+        note(text)
     return files
 
 

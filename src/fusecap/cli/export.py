@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from fusecap.cli.common import Json, RigName, Unit, checked_exports, print_json
-from fusecap.cli.terminal import wrote
+from fusecap.cli.terminal import note, wrote
 from fusecap.exports.formats import FORMATS
 
 EXAMPLE = "Example: fusecap export take.npz --format bvh,glb --rig mixamo --out files"
@@ -38,7 +38,7 @@ def export(
     """
     from fusecap.batch.replay import open_take
     from fusecap.exports.made_files import list_made
-    from fusecap.exports.take_files import plan_files
+    from fusecap.exports.take_files import held_poses, plan_files
     from fusecap.exports.take_format import ExportOptions
     from fusecap.sources.session_cameras import common_landmarks, open_rig
     from fusecap.sources.session_file import load_session
@@ -63,7 +63,10 @@ def export(
         file.write(opened)
         files.append(file.path)
         list_made(take, files)
+    notes = held_poses(opened, planned)
     if as_json:
-        print_json({"files": [str(path) for path in files]})
-    else:
-        wrote(*files)
+        print_json({"files": [str(path) for path in files], "notes": notes})
+        return
+    for text in notes:
+        note(text)
+    wrote(*files)

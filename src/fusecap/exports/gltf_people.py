@@ -108,6 +108,29 @@ def add_animation(
     gltf.add("animations", {"name": name, "samplers": samplers, "channels": channels})
 
 
+def hide_untracked(gltf: Gltf, people: list[tuple[RigMotion, list[int]]]) -> None:
+    """In the one animation: who is not tracked has no size. glTF's core knows no visibility."""
+    animation = gltf.tree["animations"][0]
+    for motion, nodes in people:
+        frames = motion.turns_of_tracked()
+        if not len(frames):
+            continue
+        owner = next(
+            index
+            for index, node in enumerate(gltf.tree["nodes"])
+            if nodes[0] in node.get("children", ())
+        )
+        size = np.repeat(motion.tracked[frames, None], 3, axis=1).astype(np.float32)
+        sampler = {
+            "input": gltf.array(motion.time_s[frames].astype(np.float32), bounds=True),
+            "output": gltf.array(size),
+            "interpolation": "STEP",
+        }
+        animation["samplers"].append(sampler)
+        target = {"node": owner, "path": "scale"}
+        animation["channels"].append({"sampler": len(animation["samplers"]) - 1, "target": target})
+
+
 def _inverse_binds(motion: RigMotion) -> Float[np.ndarray, "j 16"]:
     """Column by column, as glTF stores matrices."""
     rest = motion.rest

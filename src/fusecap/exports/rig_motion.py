@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
 from fusecap.body.shape import bones_of_extended, shape_with_clavicles
@@ -33,6 +33,14 @@ class RigMotion:
     """In the parent's frame."""
     rotation_xyzw: Float[np.ndarray, "t j 4"]
     """Relative to the parent, the rest pose included; from frame to frame the short way."""
+    tracked: Bool[np.ndarray, " t"]
+    """Others hold the last pose."""
+
+    def turns_of_tracked(self) -> Int[np.ndarray, " n"]:
+        """The first frame, and those where the person comes or goes; no frame who always stays."""
+        if self.tracked.all():
+            return np.empty(0, dtype=np.int64)
+        return np.concatenate([[0], np.flatnonzero(np.diff(self.tracked)) + 1])
 
     @cached_property
     def moving(self) -> tuple[int, ...]:
@@ -145,6 +153,7 @@ def _on_joints(
         rate_hz=take.rate_hz,
         position_m=position_m,
         rotation_xyzw=xyzw,
+        tracked=take.tracked[subject],
     )
 
 

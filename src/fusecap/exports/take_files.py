@@ -11,12 +11,16 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from fusecap.errors import InputError, TakeError, nearest
 from fusecap.exports.formats import FORMATS, format_named
 from fusecap.exports.rigs import rig_preset
 from fusecap.exports.take_format import UNITS_PER_M, ExportOptions, TakeFormat
 from fusecap.files import distinct_names, safe_name
 from fusecap.take import Take
+
+_SPANS_TOLD = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -141,6 +145,28 @@ def write_files(take: Take, files: Iterable[TakeFile]) -> list[Path]:
         file.write(take)
         paths.append(file.path)
     return paths
+
+
+def held_poses(take: Take, files: Sequence[TakeFile]) -> list[str]:
+    """Of everyone who is not tracked throughout: when, and which files show the last pose then."""
+    told = []
+    for row, name in enumerate(take.subject_names):
+        endings = {f.path.suffix: None for f in files if f.format.holds and row in f.rows}
+        tracked = take.tracked[row]
+        if not endings or tracked.all() or not tracked.any():
+            continue
+        edges = np.flatnonzero(np.diff(np.concatenate([[True], tracked, [True]])))
+        spans = [(int(first), int(end)) for first, end in edges.reshape(-1, 2)]
+        times = [
+            f"{take.time_s[first]:.2f}-{take.time_s[end - 1]:.2f}"
+            for first, end in spans[:_SPANS_TOLD]
+        ]
+        more = f" and {len(spans) - len(times)} more" if len(spans) > len(times) else ""
+        told.append(
+            f"'{name}' is not tracked in {int((~tracked).sum())} frames ({', '.join(times)} s"
+            f"{more}): {', '.join(endings)} hold the last pose there"
+        )
+    return told
 
 
 def _known_format(name: str) -> TakeFormat:

@@ -57,5 +57,7 @@ class TakeFormat:
     """A longer take goes into several files."""
     has_rig: bool = False
     """Whether joints have names and a rest pose that a preset can choose."""
+    holds: bool = False
+    """A frame without a person shows the last pose, and the file cannot say so."""
     check_needs: Callable[[], object] = nothing_needed
     """Raises `InputError` for a library or program that is not there, and what to do."""

@@ -119,5 +119,5 @@ def _vector(xyz: np.ndarray) -> str:
 
 
 FORMAT = TakeFormat(
-    suffix=".bvh", write=write_bvh, per_person=True, units=METRE_AND_CM, has_rig=True
+    suffix=".bvh", write=write_bvh, per_person=True, units=METRE_AND_CM, has_rig=True, holds=True
 )

@@ -162,5 +162,10 @@ def _rename(file: FbxFile, names: Mapping[bytes, bytes]) -> None:
 
 
 FORMAT = TakeFormat(
-    suffix=".fbx", write=write_fbx, per_person=False, has_rig=True, check_needs=blender_command
+    suffix=".fbx",
+    write=write_fbx,
+    per_person=False,
+    has_rig=True,
+    holds=True,
+    check_needs=blender_command,
 )

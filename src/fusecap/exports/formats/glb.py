@@ -1,6 +1,7 @@
 """GLB: everybody with a skin and a plain body each, and one animation; for viewers and engines.
 
-Metres, y up. Where a person is not tracked the body keeps its last pose.
+Metres, y up. Where a person is not tracked, the node of their name has the scale zero, and their
+joints the last pose.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fusecap.exports.gltf import Gltf
-from fusecap.exports.gltf_people import COLOURS, add_animation, add_body, add_joints
+from fusecap.exports.gltf_people import COLOURS, add_animation, add_body, add_joints, hide_untracked
 from fusecap.exports.rig_motion import RigMotion, rig_motions
 from fusecap.exports.take_format import ExportOptions, TakeFormat
 from fusecap.take import Take, made_by
@@ -30,6 +31,7 @@ def write_people(motions: Sequence[RigMotion], path: Path, *, animated: bool) ->
         people.append((motion, nodes))
     if animated:
         add_animation(gltf, people, "take", only_root_moves=False)
+        hide_untracked(gltf, people)
     gltf.write(path)
 
 

@@ -59,7 +59,10 @@ def _add_person(stage: Any, motion: RigMotion, scale: float, colour: tuple[float
     place, number = f"/Take/{name}", 2
     while stage.GetPrimAtPath(place):
         place, number = f"/Take/{name}_{number}", number + 1
-    pxr.UsdSkel.Root.Define(stage, place)
+    shown = pxr.UsdSkel.Root.Define(stage, place).CreateVisibilityAttr()
+    words = (pxr.UsdGeom.Tokens.invisible, pxr.UsdGeom.Tokens.inherited)
+    for frame in motion.turns_of_tracked().tolist():
+        shown.Set(words[int(motion.tracked[frame])], frame)
     rest = motion.rest
     skeleton = pxr.UsdSkel.Skeleton.Define(stage, f"{place}/{name}_rig")
     joints = pxr.Vt.TokenArray(_joint_paths(rest))

@@ -31,4 +31,4 @@ def write_vrma(take: Take, path: Path, _: ExportOptions) -> None:
     gltf.write(path)
 
 
-FORMAT = TakeFormat(suffix=".vrma", write=write_vrma, per_person=True)
+FORMAT = TakeFormat(suffix=".vrma", write=write_vrma, per_person=True, holds=True)
