@@ -40,7 +40,8 @@ from fusecap.sources.calibration_files import load_rig
 from fusecap.sources.calibration_files.formats import aniposelib
 from fusecap.sources.session_data import open_session
 from fusecap.sources.session_file import load_session
-from fusecap.take import Take, load_take
+from fusecap.stored_take import load_take
+from fusecap.take import Take
 
 SECONDS = 3.0
 FLOOR_MM, FLOOR_DEG = 15.0, 6.0
@@ -639,7 +640,7 @@ def check_clean(real: Path | None) -> int:
 
 def main() -> None:
     """Every attack, or the clean sessions."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
+    parser = argparse.ArgumentParser()
     parser.add_argument("--each", type=int, default=100, help="spoilt sessions per attack")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", help="such as both/sensors")

@@ -25,7 +25,7 @@ from fusecap.sources.session import Session
 from fusecap.sources.session_data import open_session
 from fusecap.sources.session_file import load_session
 from fusecap.stored_take import load_take
-from fusecap.types import Command, CommandKind, ImuSample, Tick
+from fusecap.types import GRAVITY_M_S2, CameraSample, Command, CommandKind, ImuSample, Tick
 from live_events import same_bits
 from recorded_run import record, simulated_run
 
@@ -240,3 +240,27 @@ def test_second_solve_expects_who_was_added_in_the_run(run, tmp_path):
     take = solve_recording(recording).take
     assert take.subject_names == ("anna", "ben")
     assert take.tracked.mean(axis=1).min() > 0.9
+
+
+def test_what_contradicts_itself_in_a_recording_is_noted_or_refused(run, tmp_path):
+    setup, taken = run
+
+    def spoilt(event):
+        if isinstance(event, CameraSample) and event.camera == 1:
+            return replace(event, people=event.people[:, setup.landmarks.mirror])
+        return event
+
+    def in_g(event):
+        if isinstance(event, ImuSample):
+            return replace(event, accel_m_s2=event.accel_m_s2 / GRAVITY_M_S2)
+        return event
+
+    def solved(change, **options):
+        changed = [(change(event), None) for event, _ in taken]
+        recording = written(tmp_path / f"{change.__name__}.mcap", setup, changed)
+        return solve_recording(recording, **options).report.notes
+
+    assert any("left and right exchanged" in note for note in solved(spoilt))
+    with pytest.raises(InputError, match="in units of g"):
+        solved(in_g)
+    assert any("in units of g" in note for note in solved(in_g, anyway=True))

@@ -9,20 +9,22 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from operator import attrgetter
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fusecap.batch.replay import Replay, loss_notes, recorded_setup
-from fusecap.batch.solve import Solved, solve_instants
+from fusecap.batch.solve import Solved, refuse_errors, solve_instants
+from fusecap.checks import check_samples
 from fusecap.engine.cameras import Cameras
 from fusecap.engine.sensors import Sensors
 from fusecap.errors import InputError
 from fusecap.geometry.quaternions import to_wxyz
 from fusecap.progress import Progress
 from fusecap.recording.reader import RecordedEvent, Recording
-from fusecap.setup import Setup, setup_of
+from fusecap.setup import SessionSetup, Setup, setup_of
 from fusecap.sources.session import Session, SubjectSettings
 from fusecap.sources.session_data import MAX_INSTANTS
 from fusecap.types import (
@@ -72,16 +74,25 @@ class RecordedInstants:
         return self._instants[instant][1]
 
 
-def solve_recording(recording: Recording, progress: Progress | None = None) -> Solved:
-    """Both passes over a recording; raises `InputError` where it holds no instant."""
-    setup, instants = recorded_inputs(recording, progress)
+def solve_recording(
+    recording: Recording, progress: Progress | None = None, *, anyway: bool = False
+) -> Solved:
+    """Both passes over a recording; what is odd about it is in the report's notes.
+
+    Raises `InputError` where it holds no instant, and for what is an error to doctor, unless
+    `anyway`.
+    """
+    setup, samples, times_ns = _recorded(recording, progress)
+    found = check_samples(setup, samples).sorted()
+    if not anyway:
+        refuse_errors(recording.path, found)
     return solve_instants(
-        setup,
-        instants,
+        setup_of(setup.session, setup.rig, setup.landmarks),
+        _instants(setup, samples, times_ns),
         progress=progress,
         session_sha256=recording.sha256(),
-        simulated=recorded_setup(recording).simulated,
-        notes=loss_notes(recording),
+        simulated=setup.simulated,
+        notes=(*loss_notes(recording), *(str(f) for f in found if f.severity != "info")),
     )
 
 
@@ -89,6 +100,19 @@ def recorded_inputs(
     recording: Recording, progress: Progress | None = None
 ) -> tuple[Setup, RecordedInstants]:
     """What a second solve works on; raises `InputError` where there is no instant."""
+    setup, samples, times_ns = _recorded(recording, progress)
+    instants = _instants(setup, samples, times_ns)
+    return setup_of(setup.session, setup.rig, setup.landmarks), instants
+
+
+def _instants(setup: SessionSetup, samples: list[Sample], times_ns: list[int]) -> RecordedInstants:
+    return RecordedInstants(setup.session, len(setup.landmarks.landmark_names), samples, times_ns)
+
+
+def _recorded(
+    recording: Recording, progress: Progress | None
+) -> tuple[SessionSetup, list[Sample], list[int]]:
+    """With who was added and how sensors sat in the end; all samples, and when to solve."""
     setup = recorded_setup(recording)
     samples: list[Sample] = []
     ticks_ns: list[int] = []
@@ -105,8 +129,7 @@ def recorded_inputs(
     session = _with_people(setup.session, commands)
     if any(command.kind is CommandKind.TPOSE for command in commands):
         session = _with_mountings(session, _mountings(recording, progress))
-    instants = RecordedInstants(session, len(setup.landmarks.landmark_names), samples, times_ns)
-    return setup_of(session, setup.rig, setup.landmarks), instants
+    return replace(setup, session=session), samples, times_ns
 
 
 def _times_ns(recording: Recording, ticks_ns: list[int], rate_hz: float) -> list[int]:

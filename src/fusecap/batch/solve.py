@@ -17,6 +17,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,6 @@ from fusecap.findings import Finding
 from fusecap.progress import Progress
 from fusecap.setup import Setup, setup_of
 from fusecap.solve.reprojection import Reprojection
-from fusecap.sources.session import Session
 from fusecap.sources.session_data import SessionData
 from fusecap.take import Take, TakeBuilder, provenance
 from fusecap.types import Detections, ImuReading
@@ -102,7 +102,7 @@ def solve_session(
     """
     found = check_measurements(data.session, data.rig, data.keypoints, data.samples, data.times_s)
     if not anyway:
-        refuse_errors(data.session, [*data.findings, *found])
+        refuse_errors(data.session.path, [*data.findings, *found])
     odd = [f for f in (*data.findings, *found.sorted()) if f.severity != "info"]
     return solve_instants(
         setup_of(data.session, data.rig, data.landmarks),
@@ -113,11 +113,11 @@ def solve_session(
     )
 
 
-def refuse_errors(session: Session, findings: Sequence[Finding]) -> None:
-    """Raises `SessionError` with what is an error, if anything is."""
+def refuse_errors(path: Path, findings: Sequence[Finding]) -> None:
+    """Raises `SessionError` with what is an error of a session or a recording, if anything is."""
     errors = [finding for finding in findings if finding.severity == "error"]
     if errors:
-        listed = "\n".join(f"{session.path}: {finding}" for finding in errors)
+        listed = "\n".join(f"{path}: {finding}" for finding in errors)
         raise SessionError(f"{listed}\nto solve it all the same: fusecap solve --anyway")
 
 

@@ -23,7 +23,6 @@ def check_keypoints(
         _check_order(track, findings)
         if rig is not None:
             _check_inside(track, rig[name], findings)
-    _check_lengths(tracks, findings)
 
 
 def _check_coverage(track: KeypointTrack, findings: Findings) -> None:
@@ -112,7 +111,8 @@ def _link_length(people: np.ndarray, landmarks: LandmarkSet) -> float:
     return float(np.nanmean(span)) if np.isfinite(span).any() else np.inf
 
 
-def _check_lengths(tracks: Mapping[str, KeypointTrack], findings: Findings) -> None:
+def check_lengths(tracks: Mapping[str, KeypointTrack], findings: Findings) -> None:
+    """Cameras that begin or end apart."""
     if len(tracks) < 2:
         return
     first = {name: float(track.times_s[0]) for name, track in tracks.items()}

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from fusecap.checks.imus import check_imus
-from fusecap.checks.keypoints import check_keypoints
+from fusecap.checks.keypoints import check_keypoints, check_lengths
 from fusecap.checks.limbs import check_limbs
 from fusecap.checks.people import check_people
 from fusecap.checks.views import ComparedViews, check_views
@@ -36,17 +36,29 @@ def check_measurements(
     findings = Findings()
     tracks = {track.name: track for track in keypoints}
     _check_rate(session, findings)
-    check_keypoints(tracks, rig, findings)
-    check_imus(session, imus, findings)
+    check_lengths(tracks, findings)
     _check_amount(session, tracks, findings)
     if times_s is not None:
         _check_length(times_s, findings)
+    check_motion(session, rig, keypoints, imus, findings)
+    return findings
+
+
+def check_motion(
+    session: Session,
+    rig: Rig | None,
+    keypoints: Sequence[KeypointTrack],
+    imus: Mapping[str, Sequence[ImuTrack | None]],
+    findings: Findings,
+) -> None:
+    """What cameras and sensors say of people, whether from files or as a live run took it."""
+    check_keypoints({track.name: track for track in keypoints}, rig, findings)
+    check_imus(session, imus, findings)
     views = None if rig is None else ComparedViews.of(rig, keypoints)
     if views is not None:
         check_views(views, findings)
         check_people(session, views, findings)
         check_limbs(session, views, imus, findings)
-    return findings
 
 
 def _check_rate(session: Session, findings: Findings) -> None:

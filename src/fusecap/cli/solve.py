@@ -82,14 +82,16 @@ def solve(
 
     exports = checked_exports("--export", export or "", unit, rig)
     if session.suffix == SUFFIX:
-        _solve_recording(session, out, exports, picture=picture, as_live=as_live, quiet=as_json)
+        _solve_recording(
+            session, out, exports, picture=picture, as_live=as_live, anyway=anyway, quiet=as_json
+        )
         return
     if as_live:
         raise InputError(f"--as-live: {session} is no recording (.mcap) of a live run")
     loaded = load_session(session)
     target = _take_path(out, loaded.folder / f"{safe_name(loaded.settings.name)}.npz")
     if not anyway:  # before hours of detection
-        refuse_errors(loaded, open_rig(loaded)[1])
+        refuse_errors(loaded.path, open_rig(loaded)[1])
     detected = detect_missing(loaded, quiet=as_json)
     if detected is not None and not as_json:
         print_detection(detected)
@@ -118,6 +120,7 @@ def _solve_recording(
     *,
     picture: bool,
     as_live: bool,
+    anyway: bool,
     quiet: bool,
 ) -> None:
     from fusecap.batch.replay import recorded_setup, solve_as_live
@@ -134,7 +137,7 @@ def _solve_recording(
             solved, again = solve_as_live(recording, progress=show)
             replay = {"replay": {"poses": again.poses, "equal": again.equal}}
         else:
-            solved = solve_recording(recording, progress=show)
+            solved = solve_recording(recording, progress=show, anyway=anyway)
     if not solved.take.tracked.any():
         _stop_without_poses(
             solved,

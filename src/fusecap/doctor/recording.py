@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from fusecap.batch.replay import recorded_setup
+from fusecap.checks import check_samples
 from fusecap.findings import Finding, Findings
 from fusecap.progress import Progress
 from fusecap.recording.reader import RecordedEvent, RecordedPose, Recording
@@ -29,11 +30,14 @@ def diagnose_recording(path: Path | str, progress: Progress | None = None) -> li
     ticks_ns: list[int] = []
     poses: dict[str, int] = {}
     commands = 0
+    samples: list[CameraSample | ImuSample] = []
     for item in recording.items(progress):
         match item:
             case RecordedEvent(event=CameraSample() as sample):
+                samples.append(sample)
                 cameras[setup.rig.names[sample.camera]].append(sample.timestamp_ns)
             case RecordedEvent(event=ImuSample() as sample):
+                samples.append(sample)
                 sensors[sample.subject][sample.bone].append(sample.timestamp_ns)
             case RecordedEvent(event=Tick() as tick):
                 ticks_ns += [] if tick.ahead else [tick.timestamp_ns]
@@ -49,6 +53,7 @@ def diagnose_recording(path: Path | str, progress: Progress | None = None) -> li
     for subject, bones in sensors.items():
         for bone, times_ns in bones.items():
             _source(f"imu '{bone}' of '{subject}'", times_ns, findings)
+    findings += check_samples(setup, samples)
     return findings.sorted()
 
 

@@ -28,6 +28,7 @@ from fusecap.live.devices.source import Delivery, SessionClock, Source
 from fusecap.live.feed import Feed
 from fusecap.live.health import Incidents, Key, ProcessLoad, inputs_of, key_of
 from fusecap.live.inbox import Inbox
+from fusecap.live.input_check import InputCheck
 from fusecap.live.latency import CAMERA, SENSOR, LatencyBook
 from fusecap.live.listeners import Listener, Listeners
 from fusecap.live.report import LiveReport, subject_reports
@@ -97,7 +98,9 @@ class LiveRun:
         self._engine = engine or Engine(setup)
         self._inbox = Inbox(self.clock)
         self._inputs = inputs_of(setup)
-        self._listeners = Listeners(listeners, self.incidents.add)
+        self._listeners = Listeners(
+            (InputCheck(setup, self.incidents.add), *listeners), self.incidents.add
+        )
         self._refused: set[str] = set()
         self._feed_of: dict[Key, Feed] = {}
         self._lateness: deque[tuple[int, int]] = deque([(0, 0)], maxlen=_ROLL_S + 1)
