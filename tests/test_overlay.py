@@ -56,7 +56,7 @@ def last_picture(path) -> np.ndarray:
 def test_solved_people_lie_where_the_camera_sees_them(scene, tmp_path):
     _, simulation = scene
     made = drawn(scene, tmp_path)
-    assert [path.name for path in made.files] == ["demo_cam1.mp4", "demo_cam2.mp4"]
+    assert [path.name for path in made.files] == ["demo_cam1_overlay.mp4", "demo_cam2_overlay.mp4"]
     assert not made.interrupted
     take, camera = simulation.truth, simulation.rig.cameras[0]
     image = last_picture(made.files[0])
@@ -84,9 +84,9 @@ def test_ctrl_c_leaves_a_whole_video_and_the_earlier_one(scene, tmp_path):
 
     made = drawn(scene, tmp_path, progress=stop)
     assert made.interrupted
-    assert [path.name for path in made.files] == ["demo_cam1_interrupted.mp4"]
+    assert [path.name for path in made.files] == ["demo_cam1_overlay_interrupted.mp4"]
     assert Video(made.files[0]).info.frames == 5
-    assert (tmp_path / "demo_cam1.mp4").read_bytes() == whole
+    assert (tmp_path / "demo_cam1_overlay.mp4").read_bytes() == whole
 
 
 def test_overlay_command_finds_the_session_beside_the_take(scene, tmp_path):

@@ -77,7 +77,7 @@ def draw_overlays(
 def draw_take(
     take: Take, session: Session, folder: Path, stem: str, progress: Progress | None = None
 ) -> DrawnVideos:
-    """Per camera with a video `<stem>_<camera>.mp4`: who was solved, and who else was found.
+    """`<stem>_<camera>_overlay.mp4` per camera with a video: who was solved, who else was found.
 
     `session` as `fusecap.sources.session_cameras.with_detections` gives it. Raises `InputError` for
     one without videos.
@@ -98,7 +98,9 @@ def draw_take(
             track = replace(track, times_s=clock.session_s(track.times_s))
         times_s = video_times_s(session, camera, video)
         solved = _Solved(take, rig[camera.name], video, times_s, track)
-        target = folder / f"{safe_name(stem)}_{name}.mp4"
+        target = folder / f"{safe_name(stem)}_{name}_overlay.mp4"
+        if any(target.resolve() == each.resolve() for _, each in shown):
+            raise InputError(f"{target} is a video of the session; name another folder with --out")
         jobs.append(_Job(name=camera.name, video=video, path=target, paint=solved.paint))
     return _draw(jobs, progress)
 

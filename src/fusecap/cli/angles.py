@@ -9,6 +9,17 @@ import numpy as np
 import typer
 
 from fusecap.cli.common import Json, print_json
+from fusecap.cli.many import (
+    Again,
+    OnRay,
+    Workers,
+    are_newer,
+    is_pattern,
+    is_take_file,
+    matching,
+    refuse_out,
+    run_many,
+)
 from fusecap.cli.terminal import console, note, table_of, wrote
 from fusecap.errors import InputError, TakeError
 
@@ -17,7 +28,12 @@ EXAMPLE = "Example: fusecap angles duo/duo.npz --out duo/angles.csv --mot --plot
 
 def angles(
     take: Annotated[
-        Path, typer.Argument(help="A solved take (.npz), or the recording (.mcap) of a live run.")
+        list[Path],
+        typer.Argument(
+            help="A solved take (.npz), or the recording (.mcap) of a live run; several, or a "
+            "pattern in quotes.",
+            show_default=False,
+        ),
     ],
     out: Annotated[
         Path | None, typer.Option(help="The table to write; default <take>_angles.csv.")
@@ -33,6 +49,9 @@ def angles(
             help="Also the legs from foot strike to foot strike: mean and band.",
         ),
     ] = False,
+    workers: Workers = None,
+    ray: OnRay = None,
+    again: Again = False,
     as_json: Json = False,
 ) -> None:
     """Joint angles by ISB conventions, in degrees, each with one standard deviation.
@@ -40,6 +59,49 @@ def angles(
     Hips, knees, ankles, shoulders, elbows, wrists, trunk and neck; docs/angles.md says about which
     axes, and what is positive.
     """
+    if not is_pattern(take):
+        _angles_of(take[0], out, mot=mot, plot=plot, gait=gait, as_json=as_json)
+        return
+    refuse_out(out)
+    run_many(
+        "angles",
+        matching(take, wanted=is_take_file, what="take or recording"),
+        {"mot": mot, "plot": plot, "gait": gait},
+        columns=("people", "files"),
+        row=lambda result: [str(len(result["people"])), str(len(result["files"]))],
+        workers=workers,
+        ray=ray,
+        again=again,
+        as_json=as_json,
+    )
+
+
+def already(path: Path, *, mot: bool, plot: bool, gait: bool) -> dict[str, Any] | None:
+    """What was made of a take before; None where some of it is missing, or older."""
+    from fusecap.files import distinct_names
+    from fusecap.stored_take import StoredTake
+
+    if path.suffix != ".npz":
+        return None
+    target = _target(path)
+    files = [target, *([target.with_name(f"{target.stem}_gait.csv")] if gait else [])]
+    with StoredTake(path) as stored:
+        people = np.flatnonzero(stored.tracked.any(axis=1)).tolist()
+        names = distinct_names(stored.subject_names)
+    endings = [ending for ending, asked in ((".mot", mot), (".png", plot)) if asked]
+    files += [target.with_name(f"{target.stem}_{names[row]}{e}") for row in people for e in endings]
+    if not are_newer(files, [path]):
+        return None
+    return {"people": [names[row] for row in people], "files": [str(file) for file in files]}
+
+
+def _target(take: Path) -> Path:
+    return take.with_name(f"{take.stem}_angles.csv")
+
+
+def _angles_of(
+    take: Path, out: Path | None, *, mot: bool, plot: bool, gait: bool, as_json: bool
+) -> None:
     from fusecap.angles.gait import gait_cycles
     from fusecap.angles.joint_angles import joint_angles
     from fusecap.batch.replay import open_take
@@ -47,7 +109,7 @@ def angles(
     from fusecap.exports.made_files import list_made
     from fusecap.files import distinct_names
 
-    target = out or take.with_name(f"{take.stem}_angles.csv")
+    target = out or _target(take)
     if target.suffix != ".csv":
         raise InputError(f"--out {target}: the table of angles is a .csv file")
     opened = open_take(take)

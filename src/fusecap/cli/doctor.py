@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from fusecap.cli.common import Json, print_json
+from fusecap.cli.many import OnRay, Workers, is_pattern, is_session, matching, run_many
 from fusecap.cli.terminal import console, progress, remark
 
 EXAMPLE = "Example: fusecap doctor recordings/duo"
@@ -15,18 +16,46 @@ EXAMPLE = "Example: fusecap doctor recordings/duo"
 
 def doctor(
     session: Annotated[
-        Path,
+        list[Path],
         typer.Argument(
-            help="session.toml, the folder that holds it, or the recording (.mcap) of a live run.",
+            help="session.toml, the folder that holds it, or the recording (.mcap) of a live run; "
+            "several, or a pattern in quotes.",
             show_default=False,
         ),
     ],
+    workers: Workers = None,
+    ray: OnRay = None,
     as_json: Json = False,
 ) -> None:
     """Check a session before it is solved: what is wrong, and what to do about it.
 
     Of a recording: what is in it, how steadily its sources came, and whether it is whole.
     """
+    if not is_pattern(session):
+        _diagnose_one(session[0], as_json=as_json)
+        return
+    run_many(
+        "doctor",
+        matching(session, wanted=is_session, what="session or recording"),
+        {},
+        columns=("errors", "warnings", "first of them"),
+        row=_row,
+        workers=workers,
+        ray=ray,
+        again=True,
+        as_json=as_json,
+        fails=lambda result: bool(result["errors"]),
+    )
+
+
+def _row(result: dict[str, Any]) -> list[str]:
+    serious = [each for each in result["findings"] if each["severity"] != "info"]
+    first = f"{serious[0]['where']}: {serious[0]['found']}" if serious else ""
+    warnings = sum(each["severity"] == "warning" for each in serious)
+    return [str(result["errors"]), str(warnings), first]
+
+
+def _diagnose_one(session: Path, *, as_json: bool) -> None:
     from dataclasses import asdict
 
     from fusecap.doctor import diagnose, diagnose_recording

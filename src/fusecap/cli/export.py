@@ -3,13 +3,28 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from fusecap.cli.common import Json, RigName, Unit, checked_exports, print_json
+from fusecap.cli.many import (
+    Again,
+    OnRay,
+    Workers,
+    are_newer,
+    is_pattern,
+    is_take_file,
+    matching,
+    run_many,
+)
 from fusecap.cli.terminal import note, wrote
+from fusecap.errors import InputError
 from fusecap.exports.formats import FORMATS
+
+if TYPE_CHECKING:
+    from fusecap.exports.take_files import TakeFile
+    from fusecap.take import Take
 
 EXAMPLE = "Example: fusecap export take.npz --format bvh,glb --rig mixamo --out files"
 _FORMATS_HELP = "One, or several with commas. " + "; ".join(
@@ -19,7 +34,12 @@ _FORMATS_HELP = "One, or several with commas. " + "; ".join(
 
 def export(
     take: Annotated[
-        Path, typer.Argument(help="A solved take (.npz), or the recording (.mcap) of a live run.")
+        list[Path],
+        typer.Argument(
+            help="A solved take (.npz), or the recording (.mcap) of a live run; several, or a "
+            "pattern in quotes.",
+            show_default=False,
+        ),
     ],
     format: Annotated[str, typer.Option(help=_FORMATS_HELP)] = "bvh",
     out: Annotated[Path | None, typer.Option(help="Folder; default: beside the take.")] = None,
@@ -29,6 +49,9 @@ def export(
         Path | None,
         typer.Option(help="Of openpose: the session whose cameras see the keypoints."),
     ] = None,
+    workers: Workers = None,
+    ray: OnRay = None,
+    again: Again = False,
     as_json: Json = False,
 ) -> None:
     """Write a take in other formats.
@@ -36,9 +59,41 @@ def export(
     A file's name says what is not usual: .cm, a rig. Of a recording: the poses as they were sent
     in the run; fusecap solve makes better ones.
     """
+    if not is_pattern(take):
+        _export_one(take[0], out, format, unit, rig, session, as_json=as_json)
+        return
+    checked_exports("--format", format, unit, rig)
+    paths = matching(take, wanted=is_take_file, what="take or recording")
+    if out is not None and len({path.stem for path in paths}) < len(paths):
+        raise InputError(f"--out {out}: two of the takes have the same name; leave it out")
+    options = {"format": format, "out": out, "unit": unit, "rig": rig, "session": session}
+    run_many(
+        "export",
+        paths,
+        options,
+        columns=("files",),
+        row=lambda result: [str(len(result["files"]))],
+        workers=workers,
+        ray=ray,
+        again=again,
+        as_json=as_json,
+    )
+
+
+def already(
+    path: Path, *, format: str, out: Path | None, unit: str | None, rig: str, session: Path | None
+) -> dict[str, Any] | None:
+    """What was exported of a take before; None where some of it is missing, or older."""
+    _, planned = _plan(path, out, format, unit, rig, session)
+    files = [file.path for file in planned]
+    return {"files": [str(file) for file in files]} if are_newer(files, [path]) else None
+
+
+def _plan(
+    take: Path, out: Path | None, format: str, unit: str | None, rig: str, session: Path | None
+) -> tuple[Take, list[TakeFile]]:
     from fusecap.batch.replay import open_take
-    from fusecap.exports.made_files import list_made
-    from fusecap.exports.take_files import held_poses, plan_files
+    from fusecap.exports.take_files import plan_files
     from fusecap.exports.take_format import ExportOptions
     from fusecap.sources.session_cameras import common_landmarks, open_rig
     from fusecap.sources.session_file import load_session
@@ -58,6 +113,23 @@ def export(
         rig=exports.rig,
         options=options,
     )
+    return opened, planned
+
+
+def _export_one(
+    take: Path,
+    out: Path | None,
+    format: str,
+    unit: str | None,
+    rig: str,
+    session: Path | None,
+    *,
+    as_json: bool,
+) -> None:
+    from fusecap.exports.made_files import list_made
+    from fusecap.exports.take_files import held_poses
+
+    opened, planned = _plan(take, out, format, unit, rig, session)
     files: list[Path] = []
     for file in planned:
         file.write(opened)

@@ -32,13 +32,14 @@ def overlay(
     out: Annotated[Path | None, typer.Option(help="Folder; default: beside the take.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Draw the solved people over the session's videos: an MP4 per camera, <take>_<camera>.mp4.
+    """Draw the solved people over the session's videos: <take>_<camera>_overlay.mp4 per camera.
 
     Left limbs are bold, bones that nothing measures are dashed and grey, people who were detected
     but are nobody of the take are thin and grey. Ctrl-C leaves a whole video of what was drawn.
     """
     from fusecap.batch.overlay import draw_take
     from fusecap.batch.replay import open_take
+    from fusecap.exports.made_files import list_made
     from fusecap.files import check_writable
     from fusecap.sources.session import FILE_NAME
     from fusecap.sources.session_cameras import with_detections
@@ -55,6 +56,7 @@ def overlay(
     with progress(quiet=as_json) as show:
         opened = open_take(take, show)
         drawn = draw_take(opened, loaded, folder, take.stem, show)
+    list_made(take, drawn.files)
     if as_json:
         files = [str(path) for path in drawn.files]
         print_json({"files": files, "interrupted": drawn.interrupted})

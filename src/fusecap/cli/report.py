@@ -8,6 +8,17 @@ from typing import Annotated, Any
 import typer
 
 from fusecap.cli.common import Json, print_json
+from fusecap.cli.many import (
+    Again,
+    OnRay,
+    Workers,
+    are_newer,
+    is_pattern,
+    is_take_file,
+    matching,
+    refuse_out,
+    run_many,
+)
 from fusecap.cli.terminal import note, progress, wrote
 from fusecap.errors import InputError, TakeError
 
@@ -16,7 +27,12 @@ EXAMPLE = "Example: fusecap report duo/duo.npz"
 
 def report(
     take: Annotated[
-        Path, typer.Argument(help="A solved take (.npz), or the recording (.mcap) of a live run.")
+        list[Path],
+        typer.Argument(
+            help="A solved take (.npz), or the recording (.mcap) of a live run; several, or a "
+            "pattern in quotes.",
+            show_default=False,
+        ),
     ],
     session: Annotated[
         Path | None,
@@ -28,6 +44,9 @@ def report(
     out: Annotated[
         Path | None, typer.Option(help="The page to write; default <take>_report.html.")
     ] = None,
+    workers: Workers = None,
+    ray: OnRay = None,
+    again: Again = False,
     as_json: Json = False,
 ) -> None:
     """One HTML page about a take: who was seen when by what, and how sure its poses are.
@@ -35,6 +54,36 @@ def report(
     It opens in any browser, without a server and without a network. Cameras and sensors are shown
     where the session is at hand.
     """
+    if not is_pattern(take):
+        _report_of(take[0], session, out, as_json=as_json)
+        return
+    refuse_out(out)
+    if session is not None:
+        raise InputError("--session: of one take alone; of many, each has its own beside it")
+    run_many(
+        "report",
+        matching(take, wanted=is_take_file, what="take or recording"),
+        {},
+        columns=("notes",),
+        row=lambda result: [str(len(result["notes"]))],
+        workers=workers,
+        ray=ray,
+        again=again,
+        as_json=as_json,
+    )
+
+
+def already(path: Path) -> dict[str, Any] | None:
+    """The page of a take, where it is newer."""
+    page = _target(path)
+    return {"files": [str(page)], "notes": []} if are_newer([page], [path]) else None
+
+
+def _target(take: Path) -> Path:
+    return take.with_name(f"{take.stem}_report.html")
+
+
+def _report_of(take: Path, session: Path | None, out: Path | None, *, as_json: bool) -> None:
     from fusecap.batch.replay import open_take
     from fusecap.batch.report_page import report_page
     from fusecap.batch.seen import look_back
@@ -42,7 +91,7 @@ def report(
     from fusecap.exports.made_files import list_made
     from fusecap.files import check_writable, write_whole
 
-    target = out or take.with_name(f"{take.stem}_report.html")
+    target = out or _target(take)
     if target.suffix != ".html":
         raise InputError(f"--out {target}: a report is an .html file")
     check_writable(target)
@@ -63,6 +112,7 @@ def report(
             findings = inputs.findings
     page = report_page(opened, take.stem, seen=seen, findings=findings, notes=notes)
     write_whole(target, page)
+    list_made(take, [target])
     list_made(take, [target])
     if as_json:
         result: dict[str, Any] = {"files": [str(target)], "notes": notes}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
@@ -19,12 +20,24 @@ from fusecap.cli.common import (
     print_speed,
     write_take,
 )
+from fusecap.cli.many import (
+    Again,
+    OnRay,
+    Workers,
+    are_newer,
+    is_pattern,
+    is_session,
+    matching,
+    refuse_out,
+    run_many,
+)
 from fusecap.cli.terminal import console, note, progress, styled, table_of
 from fusecap.errors import InputError
 from fusecap.exports.formats import FORMATS
 
 if TYPE_CHECKING:
     from fusecap.batch.solve import Solved, SolveReport
+    from fusecap.sources.session import Session
 
 EXAMPLE = (
     "Example: fusecap solve recordings/duo --export bvh; of a live run: "
@@ -34,9 +47,10 @@ EXAMPLE = (
 
 def solve(
     session: Annotated[
-        Path,
+        list[Path],
         typer.Argument(
-            help="session.toml, the folder that holds it, or the recording (.mcap) of a live run.",
+            help="session.toml, the folder that holds it, or the recording (.mcap) of a live run; "
+            "several, or a pattern in quotes.",
             show_default=False,
         ),
     ],
@@ -63,6 +77,9 @@ def solve(
         bool,
         typer.Option("--anyway", help="Also a session that doctor finds errors in."),
     ] = False,
+    workers: Workers = None,
+    ray: OnRay = None,
+    again: Again = False,
     as_json: Json = False,
 ) -> None:
     """Solve a recorded session, or the recording of a live run, to each person's motion.
@@ -70,17 +87,103 @@ def solve(
     Keypoints of videos are detected first (as `fusecap detect` does) and kept for the next time.
     A recording is solved from all that was recorded, in two passes; with --as-live its events are
     gone through as in the run, and the poses are compared with those recorded.
+
+    Many are solved on all cores; takes that are newer than their session's files stay as they are.
     """
+    exports = checked_exports("--export", export or "", unit, rig)
+    if not is_pattern(session):
+        _solve_one(session[0], out, exports, picture, as_live, anyway, as_json)
+        return
+    refuse_out(out)
+    options = {"export": export, "unit": unit, "rig": rig, "picture": picture}
+    run_many(
+        "solve",
+        matching(session, wanted=is_session, what="session or recording"),
+        options | {"as_live": as_live, "anyway": anyway},
+        columns=("people", "tracked", "bones +- deg", "joints +- mm", "notes"),
+        row=_row,
+        workers=workers,
+        ray=ray,
+        again=again,
+        as_json=as_json,
+    )
+
+
+def already(path: Path, **options: Any) -> dict[str, Any] | None:
+    """The report of a take that is newer than all that its session names, with all exports."""
+    from fusecap.errors import TakeError
+    from fusecap.exports.take_files import plan_files
+    from fusecap.recording.layout import SUFFIX
+    from fusecap.sources.session_file import input_files, load_session
+    from fusecap.stored_take import StoredTake, load_take
+    from fusecap.take import made_by
+
+    if path.suffix == SUFFIX:
+        target, inputs = _recording_take(path, as_live=options["as_live"]), [path]
+    else:
+        loaded = load_session(path)
+        target, inputs = _session_take(loaded), input_files(loaded)
+    wanted = [target, *([target.with_suffix(".png")] if options["picture"] else [])]
+    try:
+        if not are_newer(wanted, inputs):
+            return None
+        with StoredTake(target) as stored:
+            told = stored.provenance
+        exports = checked_exports(
+            "--export", options["export"] or "", options["unit"], options["rig"]
+        )
+        if told.get("made_by") != made_by() or not isinstance(told.get("report"), dict):
+            return None
+        if exports.formats:
+            planned = plan_files(
+                load_take(target),
+                target.parent,
+                formats=exports.formats,
+                stem=target.stem,
+                unit=exports.unit,
+                rig=exports.rig,
+                options=exports.options,
+            )
+            if not are_newer([file.path for file in planned], [target]):
+                return None
+    except TakeError:
+        return None
+    return {**told["report"], "files": [str(target)]}
+
+
+def _row(report: dict[str, Any]) -> list[str]:
+    people = report["subjects"].values()
+
+    def worst(key: str, form: str, of: Callable[[Iterable[float]], float], unit: float) -> str:
+        known = [each[key] for each in people if each[key] is not None]
+        return form.format(unit * of(known)) if known else "-"
+
+    return [
+        str(len(people)),
+        worst("tracked_share", "{:.1f} %", min, 100.0),
+        worst("bone_sigma_deg", "{:.1f}", max, 1.0),
+        worst("position_sigma_m", "{:.0f}", max, 1e3),
+        str(len(report["notes"])),
+    ]
+
+
+def _solve_one(
+    session: Path,
+    out: Path | None,
+    exports: Exports,
+    picture: bool,
+    as_live: bool,
+    anyway: bool,
+    as_json: bool,
+) -> None:
     from fusecap.batch.solve import refuse_errors, solve_session
     from fusecap.cli.detect import detect_missing, print_detection
     from fusecap.exports.take_format import ExportOptions
-    from fusecap.files import safe_name
     from fusecap.recording.layout import SUFFIX
     from fusecap.sources.session_cameras import open_rig
     from fusecap.sources.session_data import open_session
     from fusecap.sources.session_file import load_session
 
-    exports = checked_exports("--export", export or "", unit, rig)
     if session.suffix == SUFFIX:
         _solve_recording(
             session, out, exports, picture=picture, as_live=as_live, anyway=anyway, quiet=as_json
@@ -89,7 +192,7 @@ def solve(
     if as_live:
         raise InputError(f"--as-live: {session} is no recording (.mcap) of a live run")
     loaded = load_session(session)
-    target = _take_path(out, loaded.folder / f"{safe_name(loaded.settings.name)}.npz")
+    target = _take_path(out, _session_take(loaded))
     if not anyway:  # before hours of detection
         refuse_errors(loaded.path, open_rig(loaded)[1])
     detected = detect_missing(loaded, quiet=as_json)
@@ -128,8 +231,7 @@ def _solve_recording(
     from fusecap.exports.take_format import ExportOptions
     from fusecap.recording.reader import Recording
 
-    ending = "-as-live.npz" if as_live else ".npz"
-    target = _take_path(out, path.with_name(path.stem + ending))
+    target = _take_path(out, _recording_take(path, as_live=as_live))
     recording = Recording(path)
     replay: dict[str, dict[str, int]] = {}
     with progress(quiet=quiet) as show:
@@ -153,6 +255,16 @@ def _solve_recording(
         picture=picture,
     )
     _print_solved(solved, files, replay, quiet)
+
+
+def _session_take(session: Session) -> Path:
+    from fusecap.files import safe_name
+
+    return session.folder / f"{safe_name(session.settings.name)}.npz"
+
+
+def _recording_take(path: Path, *, as_live: bool) -> Path:
+    return path.with_name(path.stem + ("-as-live.npz" if as_live else ".npz"))
 
 
 def _take_path(out: Path | None, usual: Path) -> Path:

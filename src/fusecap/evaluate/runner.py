@@ -18,6 +18,7 @@ import logging
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 import time
 from collections import deque
@@ -45,6 +46,8 @@ _ONE_THREAD: dict[str, str] = {
     "NUMBA_NUM_THREADS": "1",
 }
 _FORMAT = "fusecap cell 1"
+Ended = tuple[str, dict[str, Any] | None, str, float]
+"""Key, result or None, error, seconds."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,7 +97,7 @@ def run_cells(
     if progress:
         for done, outcome in enumerate(outcomes.values(), start=1):
             progress(outcome, done, total)
-    for key, result, error, elapsed_s in _compute(waiting, work, workers, ray):
+    for key, result, error, elapsed_s in compute(waiting, work, workers=workers, ray=ray):
         outcome = Outcome(
             cell=waiting[key], key=key, result=result, error=error, elapsed_s=elapsed_s
         )
@@ -140,10 +143,6 @@ def _write(path: Path, outcome: Outcome, versions: Mapping[str, str]) -> None:
         file.write(json.dumps(stored, indent=1).encode())
 
 
-_Ended = tuple[str, dict[str, Any] | None, str, float]
-"""Key, result, error, seconds."""
-
-
 def _timed(work: Work, cell: Any) -> tuple[dict[str, Any] | None, str, float]:
     """Result or error, and the time it took; what fails in a cell stays in the cell."""
     started = time.perf_counter()
@@ -155,9 +154,10 @@ def _timed(work: Work, cell: Any) -> tuple[dict[str, Any] | None, str, float]:
     return result, error, time.perf_counter() - started
 
 
-def _compute(
-    waiting: Mapping[str, Any], work: Work, workers: int | None, ray: str | None
-) -> Iterator[_Ended]:
+def compute(
+    waiting: Mapping[str, Any], work: Work, *, workers: int | None = None, ray: str | None = None
+) -> Iterator[Ended]:
+    """Each of `waiting` by its key, as it ends, on all cores or on Ray; nothing is kept."""
     if not waiting:
         return iter(())
     if ray is not None:
@@ -165,7 +165,7 @@ def _compute(
     return _on_cores(waiting, work, min(workers or _cores(), len(waiting)))
 
 
-def _on_cores(waiting: Mapping[str, Any], work: Work, workers: int) -> Iterator[_Ended]:
+def _on_cores(waiting: Mapping[str, Any], work: Work, workers: int) -> Iterator[Ended]:
     """One process per core; a cell that kills its process fails alone.
 
     When a process dies every cell in flight is lost and any of them may be the cause, so each of
@@ -217,8 +217,12 @@ def _pool(count: int) -> Iterator[ProcessPoolExecutor]:
 
 
 def _quit_with_parent() -> None:
-    """A worker waits for work for ever, also when the process that had any was killed."""
+    """A worker waits for work for ever, also when the process that had any was killed.
+
+    One that is told to end leaves no unfinished file.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
     parent = multiprocessing.parent_process()
 
     def quit() -> None:
@@ -238,7 +242,7 @@ def _cores() -> int:
 
 def _on_ray(
     waiting: Mapping[str, Any], work: Work, address: str, workers: int | None
-) -> Iterator[_Ended]:
+) -> Iterator[Ended]:
     """One Ray task on one core per cell; nodes need this version of fusecap installed."""
     try:
         import ray

@@ -71,7 +71,7 @@ def _write_list(take: Path, names: set[str]) -> None:
 
 def _could_be_of(take: Path, name: str) -> bool:
     """A list is text that anybody can write: it names no inputs and nothing elsewhere."""
-    endings = {*(format_named(each).suffix for each in FORMATS), ".png", ".vrm"}
+    endings = {*(format_named(each).suffix for each in FORMATS), ".png", ".vrm", ".mp4"}
     stems = "|".join(re.escape(stem) for stem in (take.stem, safe_name(take.stem)))
     ours = re.fullmatch(rf"(?:{stems})[_.][^/\\\0]+", name)
     return ours is not None and name != take.name and Path(name).suffix.lower() in endings

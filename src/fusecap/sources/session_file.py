@@ -106,6 +106,19 @@ def missing_files(session: Session) -> list[str]:
     return lines
 
 
+def input_files(session: Session) -> list[Path]:
+    """The session file and all files and folders that it names, or that stand for its videos."""
+    settings = session.settings
+    named = [settings.calibration, settings.landmark_offsets]
+    named += [settings.imu_calibration, settings.sync]
+    for camera in session.cameras:
+        named += [camera.video, camera.keypoints or session.detection_folder(camera)]
+    named += [imu.file for subject in session.subjects for imu in subject.imus]
+    folders = [path for path in named if path is not None and path == settings.calibration]
+    inside = [file for folder in folders if folder.is_dir() for file in folder.iterdir()]
+    return [session.path, *(path for path in named if path is not None), *inside]
+
+
 _EXPECTED = {
     "missing": "missing; this key is required",
     "float_type": "found {found}, expected a number",
