@@ -65,7 +65,7 @@ def test_commands_of_a_page_are_those_of_the_command_line(page):
 def test_misuse_is_seen():
     assert "hurry" in misuse("fusecap solve duo --hurry")
     assert misuse("fusecap resolve duo") == "no command resolve"
-    assert "more" in misuse("fusecap solve duo trio")
+    assert "more" in misuse("fusecap view duo trio")
     assert not misuse("fusecap calibrate --help") and not misuse("fusecap solve duo --anyway")
 
 
