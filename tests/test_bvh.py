@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from bvh_reader import Bvh
+from fusecap.body.rigs import PRESETS
 from fusecap.body.shape import end_offsets_m
 from fusecap.body.skeleton import EXTENDED23, PAPER21
 from fusecap.cli import app
@@ -20,7 +21,6 @@ from fusecap.errors import InputError, TakeError
 from fusecap.exports.euler import euler_rad
 from fusecap.exports.formats import FORMATS, format_named
 from fusecap.exports.formats.bvh import _ORDERS, write_bvh
-from fusecap.exports.rigs import PRESETS
 from fusecap.exports.take_files import export, export_take
 from fusecap.exports.take_format import ExportOptions, TakeFormat
 from fusecap.stored_take import load_take

@@ -21,6 +21,7 @@ import fusecap
 from export_people import NEAR_DEG, NEAR_M, degrees_apart, two_walkers, with_gap
 from fusecap.body.landmarks import landmark_set_named
 from fusecap.body.pose import landmarks_in_world
+from fusecap.body.rigs import PRESETS
 from fusecap.body.shape import shape_with_clavicles
 from fusecap.body.skeleton import EXTENDED23, PAPER21
 from fusecap.cli import app
@@ -34,7 +35,6 @@ from fusecap.exports.markers import bone_markers
 from fusecap.exports.opensim import OPENSIM_FROM_OURS
 from fusecap.exports.rest_rig import rest_rig
 from fusecap.exports.rig_motion import rig_motion
-from fusecap.exports.rigs import PRESETS
 from fusecap.exports.take_files import export_take, plan_files
 from fusecap.exports.take_format import ExportOptions
 from fusecap.feet import foot_events, standing

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 import fusecap
 from export_people import NEAR_M, two_walkers, with_gap
+from fusecap.body.rigs import PRESETS
 from fusecap.body.shape import BodyShape
 from fusecap.body.skeleton import EXTENDED23, PAPER21
 from fusecap.cli import app
@@ -21,7 +22,6 @@ from fusecap.exports.characters.character import read_character
 from fusecap.exports.gltf import Gltf
 from fusecap.exports.gltf_people import add_body, add_joints
 from fusecap.exports.rig_motion import rig_motion
-from fusecap.exports.rigs import PRESETS
 from fusecap.feet import standing
 from fusecap.take import save_take
 from motions import person, take_of, walk

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from fusecap.body.rigs import PRESETS
 from fusecap.cli.terminal import console, err, note, wrote
 from fusecap.errors import nearest
 from fusecap.exports.formats import FORMATS
-from fusecap.exports.rigs import PRESETS
 from fusecap.files import plain
 
 if TYPE_CHECKING:

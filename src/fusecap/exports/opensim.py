@@ -17,12 +17,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from fusecap.body.rigs import RigJoint, RigPreset
 from fusecap.body.shape import BodyShape
 from fusecap.exports.euler import euler_rad
 from fusecap.exports.markers import bone_markers
 from fusecap.exports.rest_rig import RestRig
 from fusecap.exports.rig_motion import rig_motion
-from fusecap.exports.rigs import RigJoint, RigPreset
 from fusecap.take import Take
 
 OPENSIM_FROM_OURS = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float
 
 from fusecap.body.pose import forward_kinematics
+from fusecap.body.rigs import RigJoint, RigPreset
 from fusecap.body.shape import BodyShape, end_offsets_m
 from fusecap.body.skeleton import EXTENDED23
-from fusecap.exports.rigs import RigJoint, RigPreset
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
+from fusecap.body.rigs import RigPreset, rig_preset
 from fusecap.body.shape import bones_of_extended, shape_with_clavicles
 from fusecap.body.skeleton import EXTENDED23
 from fusecap.errors import TakeError
 from fusecap.exports.rest_rig import RestRig, rest_rig
-from fusecap.exports.rigs import RigPreset, rig_preset
 from fusecap.geometry.quaternions import from_wxyz
 from fusecap.take import Take
 

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
+from fusecap.body.rigs import rig_preset
 from fusecap.errors import InputError, TakeError, nearest
 from fusecap.exports.formats import FORMATS, format_named
-from fusecap.exports.rigs import rig_preset
 from fusecap.exports.take_format import UNITS_PER_M, ExportOptions, TakeFormat
 from fusecap.files import distinct_names, safe_name
 from fusecap.take import Take

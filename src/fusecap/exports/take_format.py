@@ -24,7 +24,7 @@ class ExportOptions:
     unit: str = "m"
     """One of the format's."""
     rig: str = "native"
-    """One of `fusecap.exports.rigs.PRESETS`."""
+    """One of `fusecap.body.rigs.PRESETS`."""
     cameras: Rig | None = None
     """Those that keypoints are seen by."""
     landmarks: LandmarkSet | None = None

@@ -15,32 +15,19 @@ from scipy.spatial.transform import Rotation
 
 from fusecap.body.shape import REFERENCE_HEIGHT_M, BodyShape, end_offsets_m
 from fusecap.body.skeleton import Skeleton
+from fusecap.body.sticks import (
+    HEAD_CENTRE_M,
+    HEAD_M,
+    NOSE_M,
+    NOSE_RADIUS_M,
+    RIGHT_SHADE,
+    stick_radius_m,
+)
 from fusecap.geometry.quaternions import to_wxyz
 from fusecap.types import Estimate
 from fusecap.viewer.palette import PALE_RGB, Rgb
 
-_RADII_M = {
-    "hips": 0.055,
-    "spine": 0.065,
-    "neck": 0.040,
-    "head": 0.035,
-    "clavicle": 0.040,
-    "upper_arm": 0.040,
-    "forearm": 0.033,
-    "hand": 0.024,
-    "thigh": 0.056,
-    "shank": 0.044,
-    "foot": 0.028,
-    "toes": 0.018,
-}
-"""Of a bone's stick, by its name without side and number, for a person of the reference height."""
-_HEAD_M = (0.075, 0.105, 0.092)
-"""Half axes of the head: left, up, forward."""
-_HEAD_CENTRE_M = (0.0, 0.085, 0.015)
-_NOSE_M = (0.0, 0.065, 0.110)
-_NOSE_RADIUS_M = 0.020
 _NAME_ABOVE_HEAD_M = 0.30
-_RIGHT_SHADE = 0.65
 _QUALITY_STEPS = 16
 """Colours change by steps this fine, so that most frames send none."""
 _LEAST_COLOUR = 0.3
@@ -103,7 +90,7 @@ class Figure:
             [skeleton.parents[bone] for bone in self._children] + self._leaves
         )
         self._ball_bones = np.array([*bones, *self._leaves, self._head, self._head])
-        radius_m = np.array([_radius_m(name) for name in names])
+        radius_m = np.array([stick_radius_m(name) for name in names])
         self._stick_radius_m = radius_m[self._stick_bones]
         joint_m = radius_m.copy()
         for stick, child in enumerate(self._children):
@@ -114,8 +101,8 @@ class Figure:
                 joint_m[child] = max(radius_m[child], radius_m[parent])
         self._ball_size_m = np.repeat(joint_m[self._ball_bones][:, None], 3, axis=1)
         self._ball_size_m[len(names) : -2] = radius_m[self._leaves][:, None]
-        self._ball_size_m[-2], self._ball_size_m[-1] = _HEAD_M, _NOSE_RADIUS_M
-        self._shade = np.array([_RIGHT_SHADE if n.startswith("right_") else 1.0 for n in names])
+        self._ball_size_m[-2], self._ball_size_m[-1] = HEAD_M, NOSE_RADIUS_M
+        self._shade = np.array([RIGHT_SHADE if n.startswith("right_") else 1.0 for n in names])
 
     @property
     def stick_count(self) -> int:
@@ -144,7 +131,7 @@ class Figure:
         """Instances of a sphere of radius 1."""
         size = _size(pose.shape)
         head_m, head_rotation = pose.position_m[self._head], pose.rotation[self._head]
-        face_m = head_m + size * np.array([_HEAD_CENTRE_M, _NOSE_M]) @ head_rotation.T
+        face_m = head_m + size * np.array([HEAD_CENTRE_M, NOSE_M]) @ head_rotation.T
         wxyz = np.tile([1.0, 0.0, 0.0, 0.0], (self.ball_count, 1))
         wxyz[-2] = to_wxyz(Rotation.from_matrix(head_rotation))
         return Parts(
@@ -171,10 +158,6 @@ class Figure:
         share = (_LEAST_COLOUR + (1 - _LEAST_COLOUR) * quality)[:, None]
         rgb = self._shade[:, None] * (share * np.array(colour) + (1 - share) * np.array(PALE_RGB))
         return rgb[bones].astype(np.uint8)
-
-
-def _radius_m(name: str) -> float:
-    return _RADII_M[name.removeprefix("left_").removeprefix("right_").rstrip("0123456789")]
 
 
 def _sided(name: str) -> bool:

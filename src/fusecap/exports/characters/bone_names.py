@@ -8,10 +8,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from fusecap.body.rigs import PRESETS
 from fusecap.errors import InputError, nearest
 from fusecap.exports.characters.bone_words import NEEDED, guess_bones, spine_of
 from fusecap.exports.characters.character import Character
-from fusecap.exports.rigs import PRESETS
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from fusecap.body.rigs import PRESETS
 from fusecap.errors import InputError
 from fusecap.exports.blender import fbx_from_glb, run_in_blender
 from fusecap.exports.characters.bone_names import BoneMap, bone_map
@@ -28,7 +29,6 @@ from fusecap.exports.characters.character import Character, read_character
 from fusecap.exports.gltf import Gltf
 from fusecap.exports.library import written_by_name
 from fusecap.exports.rig_motion import RigMotion, rig_motion, short_way
-from fusecap.exports.rigs import PRESETS
 from fusecap.geometry.two_bone import STRETCHED, least_turns, two_bone_turns
 from fusecap.take import Take
 

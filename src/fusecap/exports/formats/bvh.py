@@ -23,10 +23,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from fusecap.body.rigs import rig_preset
 from fusecap.exports.euler import euler_rad
 from fusecap.exports.rest_rig import RestRig
 from fusecap.exports.rig_motion import rig_motion
-from fusecap.exports.rigs import rig_preset
 from fusecap.exports.take_format import METRE_AND_CM, UNITS_PER_M, ExportOptions, TakeFormat
 from fusecap.files import written_whole
 from fusecap.take import Take

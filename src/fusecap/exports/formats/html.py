@@ -15,6 +15,14 @@ from typing import Any
 import numpy as np
 
 from fusecap.body.shape import REFERENCE_HEIGHT_M
+from fusecap.body.sticks import (
+    HEAD_CENTRE_M,
+    HEAD_M,
+    NOSE_M,
+    NOSE_RADIUS_M,
+    RIGHT_SHADE,
+    stick_radius_m,
+)
 from fusecap.exports.gltf_people import COLOURS
 from fusecap.exports.rest_rig import RestRig
 from fusecap.exports.rig_motion import RigMotion, rig_motions
@@ -23,24 +31,6 @@ from fusecap.files import write_whole
 from fusecap.take import Take
 
 _MOST, _HIDDEN = 32767, -32768
-_HEAD_M, _NOSE_M = np.array([0.0, 0.090, 0.015]), np.array([0.0, 0.070, 0.115])
-_HEAD_RADIUS_M = 0.098
-_RADII_M = {
-    "hips": 0.085,
-    "spine": 0.095,
-    "neck": 0.045,
-    "head": 0.045,
-    "pelvis": 0.075,
-    "clavicle": 0.055,
-    "upper_arm": 0.043,
-    "forearm": 0.034,
-    "hand": 0.025,
-    "thigh": 0.065,
-    "shank": 0.046,
-    "foot": 0.030,
-    "toes": 0.022,
-}
-"""Of a bone's stick, by its name without side and number, for a person of 1.75 m."""
 
 
 def write_html(take: Take, path: Path, _: ExportOptions) -> None:
@@ -84,7 +74,10 @@ def _points_m(motion: RigMotion) -> np.ndarray:
         for leaf in rest.leaves
     ]
     head = rest.names.index("head")
-    face = [places[head] + turns[head].apply(_size(rest) * at) for at in (_HEAD_M, _NOSE_M)]
+    face = [
+        places[head] + turns[head].apply(_size(rest) * np.array(at))
+        for at in (HEAD_CENTRE_M, NOSE_M)
+    ]
     return np.stack([*places, *tips, *face], axis=1)
 
 
@@ -94,8 +87,8 @@ def _sticks(rest: RestRig) -> list[list[float]]:
     sticks = []
     for joint, name in enumerate(rest.names):
         children = [child for child, parent in enumerate(rest.parents) if parent == joint]
-        shade = 0.65 if name.startswith("right_") else 1.0
-        radius = _size(rest) * _RADII_M[_kind(name)]
+        shade = RIGHT_SHADE if name.startswith("right_") else 1.0
+        radius = _size(rest) * stick_radius_m(name)
         if joint in ends and name != "head":
             sticks.append([joint, ends[joint], radius, shade])
         for child in children:
@@ -103,17 +96,15 @@ def _sticks(rest: RestRig) -> list[list[float]]:
             side = between.startswith(("left_", "right_")) and not name.startswith(
                 ("left_", "right_")
             )
-            thin = _size(rest) * _RADII_M[_kind(between)] if side else radius
-            sticks.append([joint, child, thin, 0.65 if between.startswith("right_") else shade])
+            thin = _size(rest) * stick_radius_m(between) if side else radius
+            sticks.append(
+                [joint, child, thin, RIGHT_SHADE if between.startswith("right_") else shade]
+            )
     head = len(rest.names) + len(rest.leaves)
-    sticks.append([rest.names.index("head"), head, _size(rest) * _RADII_M["head"], 1.0])
-    sticks.append([head, head, _size(rest) * _HEAD_RADIUS_M, 1.0])
-    sticks.append([head + 1, head + 1, _size(rest) * 0.02, 0.9])
+    sticks.append([rest.names.index("head"), head, _size(rest) * stick_radius_m("head"), 1.0])
+    sticks.append([head, head, _size(rest) * HEAD_M[2], 1.0])
+    sticks.append([head + 1, head + 1, _size(rest) * NOSE_RADIUS_M, 0.9])
     return sticks
-
-
-def _kind(name: str) -> str:
-    return name.removeprefix("left_").removeprefix("right_").rstrip("0123456789")
 
 
 def _size(rest: RestRig) -> float:

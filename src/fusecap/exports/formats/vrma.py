@@ -1,7 +1,7 @@
 """VRMA: a person's motion for any VRM avatar (VRMC_vrm_animation 1.0, a GLB with a map of bones).
 
 The extension knows rotations of bones and the place of the hips, no other places: the folded spine
-(`fusecap.exports.rigs`) puts what is above it within millimetres, as it does on any avatar.
+(`fusecap.body.rigs`) puts what is above it within millimetres, as it does on any avatar.
 """
 
 from __future__ import annotations

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from fusecap.body.rigs import PRESETS
 from fusecap.body.skeleton import EXTENDED23
 from fusecap.geometry.quaternions import to_xyzw
 from fusecap.streams.axes import UNREAL
@@ -31,30 +32,7 @@ from fusecap.streams.stream import udp_protocol
 MAX_BYTES = 8192
 """Of a datagram with several subjects: macOS sends no more than 9216 unless told to."""
 
-_UNREAL = {
-    "hips": "pelvis",
-    "spine": "spine_01",
-    "spine1": "spine_02",
-    "spine2": "spine_03",
-    "spine3": "spine_04",
-    "neck": "neck_01",
-    "head": "head",
-}
-for _side in ("left", "right"):
-    _UNREAL |= {
-        f"{_side}_{ours}": f"{theirs}_{_side[0]}"
-        for ours, theirs in {
-            "clavicle": "clavicle",
-            "upper_arm": "upperarm",
-            "forearm": "lowerarm",
-            "hand": "hand",
-            "thigh": "thigh",
-            "shank": "calf",
-            "foot": "foot",
-            "toes": "ball",
-        }.items()
-    }
-_NAMES = [_UNREAL[bone] for bone in EXTENDED23.bone_names]
+_NAMES = [PRESETS["ue5"].name_at[bone] for bone in EXTENDED23.bone_names]
 
 
 def livelink_datagrams(frame: StreamFrame, max_bytes: int = MAX_BYTES) -> list[bytes]:

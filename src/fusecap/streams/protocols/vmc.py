@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from scipy.spatial.transform import Rotation
 
+from fusecap.body.rigs import PRESETS
 from fusecap.body.skeleton import EXTENDED23
 from fusecap.errors import InputError
 from fusecap.geometry.quaternions import to_xyzw
@@ -30,28 +31,10 @@ PORT_STEP = 10
 
 _LOADED, _CALIBRATED, _NORMAL_MODE = 1, 3, 0
 
-_TREE = {
-    "Hips": ("hips", ""),
-    "Spine": ("spine", "Hips"),
-    "Chest": ("spine2", "Spine"),
-    "UpperChest": ("spine3", "Chest"),
-    "Neck": ("neck", "UpperChest"),
-    "Head": ("head", "Neck"),
-}
-for _side, _Side in (("left", "Left"), ("right", "Right")):
-    _TREE |= {
-        f"{_Side}Shoulder": (f"{_side}_clavicle", "UpperChest"),
-        f"{_Side}UpperArm": (f"{_side}_upper_arm", f"{_Side}Shoulder"),
-        f"{_Side}LowerArm": (f"{_side}_forearm", f"{_Side}UpperArm"),
-        f"{_Side}Hand": (f"{_side}_hand", f"{_Side}LowerArm"),
-        f"{_Side}UpperLeg": (f"{_side}_thigh", "Hips"),
-        f"{_Side}LowerLeg": (f"{_side}_shank", f"{_Side}UpperLeg"),
-        f"{_Side}Foot": (f"{_side}_foot", f"{_Side}LowerLeg"),
-        f"{_Side}Toes": (f"{_side}_toes", f"{_Side}Foot"),
-    }
-_NAMES = tuple(_TREE)
-_BONES = [EXTENDED23.bone(bone) for bone, _ in _TREE.values()]
-_PARENTS = tuple(_NAMES.index(parent) if parent else -1 for _, parent in _TREE.values())
+_JOINTS = PRESETS["unity"].joints
+_NAMES = tuple(joint.name for joint in _JOINTS)
+_BONES = [EXTENDED23.bone(joint.sits_at) for joint in _JOINTS]
+_PARENTS = tuple(_NAMES.index(joint.parent) if joint.parent else -1 for joint in _JOINTS)
 
 
 def vmc_datagrams(pose: PersonPose | None, time_s: float) -> list[bytes]:

@@ -1,4 +1,4 @@
-"""Rigs: the joints that an exported character has, by preset.
+"""Rigs: the joints that other programs' characters have, by preset; exports and streams use them.
 
 A preset says what its joints are called, which of our bones each turns with, where it sits, how the
 character stands at rest and how the joints' axes lie there. What was solved does not change: every
@@ -49,6 +49,12 @@ class RigPreset:
     """Whether that axis points against the bone on the right side."""
     rest_deg: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     """Angle-axis vectors of bones at rest [deg], local; a T-pose without."""
+
+    @property
+    def name_at(self) -> dict[str, str]:
+        """Names of joints by our bones that have the same place and turn them."""
+        ours = (j for j in self.joints if j.turns_with[:1] == (j.sits_at,) and j.towards is None)
+        return {joint.sits_at: joint.name for joint in ours}
 
 
 def rig_preset(name: str) -> RigPreset:
