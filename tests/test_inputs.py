@@ -26,7 +26,7 @@ from fusecap.evaluate.datasets.safe_pickle import load_npz_object, load_pickle
 from fusecap.evaluate.datasets.shelf import load_truth, read_actors
 from fusecap.evaluate.scene_motion import load_motion
 from fusecap.exports.characters.character import read_character
-from fusecap.inputs import CALIBRATION, SETTINGS, TAKE, read_json, read_npz, read_toml
+from fusecap.inputs import CALIBRATION, SETTINGS, TAKE, check_input, read_json, read_npz, read_toml
 from fusecap.recording.reader import Recording
 from fusecap.sources.calibration_files import load_rig
 from fusecap.sources.detection_files import read_record
@@ -331,6 +331,7 @@ def test_nothing_else_opens_files_from_outside():
         "live/recorder.py",  # writes
         "exports/overlay.py",  # writes
         "exports/library.py",  # what a library has just written
+        "exports/formats/fbx.py",  # what Blender has just written
         "exports/formats/html.py",  # shipped
         "streams/stream.py",  # opens a protocol
         "cli/view.py",  # opens a browser
@@ -360,3 +361,12 @@ def test_nothing_else_opens_files_from_outside():
                 continue
             found.append((name, node.lineno))
     assert found == []
+
+
+def test_a_file_that_is_missing_names_those_beside_it(tmp_path):
+    for name in ("kam_s1.npz", "truth.npz", "session.toml"):
+        (tmp_path / name).touch()
+    with pytest.raises(InputError, match=r"no such file; .*; there is kam_s1.npz, truth.npz$"):
+        check_input(tmp_path / "walker.npz", TAKE)
+    with pytest.raises(InputError, match=r"expected a take \(\.npz\)$"):
+        check_input(tmp_path / "nowhere" / "walker.npz", TAKE)

@@ -10,6 +10,7 @@ wants to become.
 from __future__ import annotations
 
 import io
+import itertools
 import json
 import math
 import os
@@ -35,6 +36,8 @@ MOST_KEY_PARTS = 10_000_000
 """Dots in keys of a TOML file times those of its longest: 80 MB of its parser's memory."""
 MOST_ENTRIES = 1000
 """In a zip file."""
+_MOST_NAMED = 4
+"""Files beside one that is missing; more are no help."""
 _LOCAL_HEADER = struct.Struct("<26x2H")
 """Before an entry of a zip file; how long its name and its remarks are, which follow."""
 
@@ -113,7 +116,8 @@ def open_input(path: Path | str, kind: InputKind) -> io.BufferedReader:
     try:
         handle = os.open(path, flags)
     except FileNotFoundError:
-        raise kind.error(f"{path}: no such file; expected {kind.what}") from None
+        beside = _beside(Path(path))
+        raise kind.error(f"{path}: no such file; expected {kind.what}{beside}") from None
     except IsADirectoryError:
         raise kind.error(f"{path}: is a folder; expected {kind.what}") from None
     except (OSError, ValueError) as error:
@@ -124,6 +128,17 @@ def open_input(path: Path | str, kind: InputKind) -> io.BufferedReader:
     except BaseException:
         os.close(handle)
         raise
+
+
+def _beside(path: Path) -> str:
+    """What is there of the same ending, for who guessed the name of a file."""
+    try:
+        with os.scandir(path.parent) as entries:
+            names = [entry.name for entry in itertools.islice(entries, MOST_ENTRIES)]
+    except (OSError, ValueError):
+        return ""
+    alike = sorted(name for name in names if path.suffix and name.endswith(path.suffix))
+    return f"; there is {', '.join(alike)}" if 0 < len(alike) <= _MOST_NAMED else ""
 
 
 def check_input(path: Path | str, kind: InputKind) -> None:

@@ -85,6 +85,7 @@ def import_packages(
     for package in packages:
         for name in import_models(package):
             console.print(f"{name}: {MODELS[name].about}; {MODELS[name].licence}", soft_wrap=True)
+    console.print("use them by name: model and person_model under [detector] in session.toml")
 
 
 def ask_for_networks(options: DetectorOptions, *, quiet: bool) -> None:

