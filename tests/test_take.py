@@ -12,7 +12,8 @@ from fusecap.body.skeleton import EXTENDED23, PAPER21
 from fusecap.errors import TakeError
 from fusecap.files import written_whole
 from fusecap.stored_take import StoredTake, load_take
-from fusecap.take import MOTION, Take, TakeBuilder, provenance, save_take
+from fusecap.take import MOTION, Take, provenance, save_take
+from fusecap.take_builder import TakeBuilder
 from fusecap.types import Estimate, Status
 from motions import any_poses, person, take_of, walk
 
@@ -315,9 +316,13 @@ def test_frames_in_the_file_are_those_of_the_whole(tmp_path, take, packed):
 
 def test_what_is_wrong_far_inside_is_found_without_reading_all_at_once(tmp_path):
     take = take_of(np.zeros((1, 20_000, PAPER21.pose_size)), [person()], names=("anna",))
-    take.theta[0, 19_000, 5] = 1e9
     path = tmp_path / "take.npz"
     save_take(take, path)
+    with np.load(path) as archive:
+        arrays = dict(archive)
+    arrays["theta"][0, 19_000, 5] = 1e9
+    np.savez(path, **arrays)
+    del arrays
     tracemalloc.start()
     try:
         with StoredTake(path) as stored:

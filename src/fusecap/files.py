@@ -1,4 +1,4 @@
-"""Writing files whole or not at all, and what JSON can hold."""
+"""Writing files whole or not at all, what JSON can hold, and numbers too many for memory."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import contextlib
 import itertools
 import math
 import os
+import tempfile
+import weakref
 from collections.abc import Iterable, Iterator, Mapping
 from enum import Enum
 from pathlib import Path
@@ -13,7 +15,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
-from fusecap.errors import TakeError
+from fusecap.errors import FusecapError, TakeError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -98,3 +100,42 @@ def plain(value: Any) -> Any:
         case float() if not math.isfinite(value):
             return None
     return value
+
+
+class Spool:
+    """Bytes in an unnamed temporary file once they are many; gone when nobody holds it."""
+
+    IN_MEMORY = 1 << 22
+
+    def __init__(self) -> None:
+        self._file = tempfile.SpooledTemporaryFile(self.IN_MEMORY, prefix="fusecap-")  # noqa: SIM115
+        self._length, self._at_end = 0, True
+        weakref.finalize(self, self._file.close)
+
+    def __len__(self) -> int:
+        return self._length
+
+    def append(self, data: bytes) -> None:
+        """Raises `FusecapError` where the disk is full."""
+        try:
+            if not self._at_end:
+                self._file.seek(self._length)
+                self._at_end = True
+            self._file.write(data)
+        except OSError as error:
+            raise FusecapError(
+                f"no room in {tempfile.gettempdir()} for what a take needs while it is made "
+                f"({error.strerror or error}): set TMPDIR to a folder with more"
+            ) from error
+        self._length += len(data)
+
+    def read(self, first: int, count: int) -> bytearray:
+        """So many bytes from the `first`; fewer at the end."""
+        self._file.seek(first)
+        self._at_end = False
+        return bytearray(self._file.read(count))
+
+    def parts(self) -> Iterator[bytearray]:
+        """All of it, piece by piece."""
+        for first in range(0, self._length, self.IN_MEMORY):
+            yield self.read(first, self.IN_MEMORY)

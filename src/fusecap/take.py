@@ -9,6 +9,7 @@ no forward kinematics. NaN stands only where `tracked` is false.
 from __future__ import annotations
 
 import json
+import zipfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import metadata
@@ -21,23 +22,27 @@ from scipy.spatial.transform import Rotation
 
 from fusecap.believable import MAX_M
 from fusecap.body.pose import forward_kinematics
-from fusecap.body.shape import MAX_OFFSET_M, REFERENCE_HEIGHT_M, BodyShape
+from fusecap.body.shape import MAX_OFFSET_M, BodyShape
 from fusecap.body.skeleton import Skeleton
 from fusecap.errors import TakeError, nearest
-from fusecap.files import written_whole
+from fusecap.files import Spool, written_whole
 from fusecap.geometry.quaternions import from_wxyz, to_wxyz
-from fusecap.types import Estimate, Status, quality_of
+from fusecap.types import quality_of
 
 FORMAT_VERSION = 2
 FORMAT_NAME = "fusecap take "
 FORMAT = f"{FORMAT_NAME}{FORMAT_VERSION}"
-MOTION = (
-    *("theta", "bone_position_in_world_m", "bone_rotation_in_world_wxyz"),
-    *("bone_sigma_deg", "position_sigma_m"),
-)
-"""The arrays of numbers per subject and frame."""
-_CHECKED_FRAMES = 2048
-"""At a time, so that a check takes no memory to speak of."""
+BLOCK = 2048
+"""Frames checked or written at a time, so that it takes no memory to speak of."""
+STORED = {
+    "theta": np.float32,
+    "bone_position_in_world_m": np.float32,
+    "bone_rotation_in_world_wxyz": np.float32,
+    "bone_sigma_deg": np.float16,
+    "position_sigma_m": np.float16,
+}
+"""The arrays of numbers per subject and frame, and as what a file holds them."""
+MOTION = tuple(STORED)
 
 UNITS = {
     "timestamps_ns": "ns, one clock",
@@ -95,8 +100,8 @@ class Take:
             raise TakeError(f"offsets_m hold a value that is no number up to {MAX_OFFSET_M:g} m")
         if not ((self.heights_m > 0) & (self.heights_m <= MAX_OFFSET_M)).all():
             raise TakeError(f"heights_m are {self.heights_m}, expected metres above zero")
-        for first in range(0, t, _CHECKED_FRAMES):
-            self._check_frames(first, first + _CHECKED_FRAMES)
+        for first in range(0, t, BLOCK):
+            self._check_frames(first, first + BLOCK)
 
     def _check_frames(self, first: int, end: int) -> None:
         tracked = self.tracked[:, first:end]
@@ -243,75 +248,6 @@ def array_shapes(subjects: int, frames: int, bones: int) -> dict[str, tuple[int,
     }
 
 
-class TakeBuilder:
-    """Collects estimates frame by frame; `build` gives a valid take at any moment.
-
-    A subject is known by its name, so one that leaves and returns on a new track goes on in the
-    same row. Subjects stand in the order of `subject_names`, then of first appearance. A body has
-    one shape: the last one a subject was solved with poses all its frames. A solve that diverged
-    counts as untracked.
-    """
-
-    def __init__(
-        self,
-        *,
-        skeleton: Skeleton,
-        rate_hz: float,
-        subject_names: Sequence[str] = (),
-        provenance: Mapping[str, Any] | None = None,
-    ) -> None:
-        self._skeleton = skeleton
-        self._rate_hz = rate_hz
-        self._provenance = dict(provenance or {})
-        self._timestamps_ns: list[int] = []
-        self._solved: dict[str, list[tuple[int, np.ndarray, np.ndarray, np.ndarray]]] = {
-            name: [] for name in subject_names
-        }
-        """Per subject: frame, theta, bone_sigma_deg, position_sigma_m."""
-        self._shapes: dict[str, BodyShape] = {}
-
-    def add(self, timestamp_ns: int, estimates: Iterable[Estimate]) -> None:
-        """The next frame: everyone solved at `timestamp_ns`; nobody is fine."""
-        frame = len(self._timestamps_ns)
-        self._timestamps_ns.append(timestamp_ns)
-        for estimate in estimates:
-            rows = self._solved.setdefault(estimate.name, [])
-            if rows and rows[-1][0] == frame:
-                raise TakeError(f"two estimates of '{estimate.name}' at {timestamp_ns} ns")
-            self._shapes[estimate.name] = estimate.shape
-            if estimate.status is not Status.DIVERGED:
-                sigmas = estimate.bone_sigma_deg.copy(), estimate.position_sigma_m.copy()
-                rows.append((frame, estimate.theta.copy(), *sigmas))
-
-    def build(self) -> Take:
-        """What was added so far; subjects never seen have the reference shape and no frame."""
-        skeleton = self._skeleton
-        s, t, b = len(self._solved), len(self._timestamps_ns), skeleton.bone_count
-        reference = BodyShape.from_height(skeleton, REFERENCE_HEIGHT_M)
-        shapes = [self._shapes.get(name, reference) for name in self._solved]
-        theta = np.full((s, t, skeleton.pose_size), np.nan)
-        bone_sigma_deg, position_sigma_m = np.full((2, s, t, b), np.nan)
-        tracked = np.zeros((s, t), dtype=bool)
-        for subject, rows in enumerate(self._solved.values()):
-            for frame, pose, turn, place in rows:
-                theta[subject, frame] = pose
-                bone_sigma_deg[subject, frame] = turn
-                position_sigma_m[subject, frame] = place
-                tracked[subject, frame] = True
-        return take_from_theta(
-            theta,
-            shapes,
-            timestamps_ns=np.array(self._timestamps_ns, dtype=np.int64),
-            rate_hz=self._rate_hz,
-            subject_names=tuple(self._solved),
-            skeleton=skeleton,
-            tracked=tracked,
-            bone_sigma_deg=bone_sigma_deg,
-            position_sigma_m=position_sigma_m,
-            provenance=self._provenance,
-        )
-
-
 def take_from_theta(
     theta: Float[np.ndarray, "s t p"],
     shapes: Sequence[BodyShape],
@@ -365,26 +301,54 @@ def save_take(take: Take, path: Path | str) -> None:
     Poses as float32, which is right to a micrometre 10 m from the origin and to 1e-5 deg; error
     bars as float16, right to 0.1 %.
     """
+    frames = len(take.timestamps_ns)
+    blocks = (take.of_frames(at, at + BLOCK) for at in range(0, frames, BLOCK))
+    save_blocks(take.of_frames(0, 0), blocks, path)
+
+
+def save_blocks(nothing: Take, blocks: Iterable[Take], path: Path | str) -> None:
+    """`save_take` of one that is made block by block, and never in memory at once.
+
+    `nothing` is the take without its frames. Raises `TakeError`.
+    """
+    columns = {name: [Spool() for _ in nothing.subject_names] for name in STORED}
+    timestamps_ns, tracked = [nothing.timestamps_ns], [nothing.tracked]
+    for block in blocks:
+        timestamps_ns.append(block.timestamps_ns)
+        tracked.append(block.tracked)
+        for name, spools in columns.items():
+            for spool, values in zip(spools, getattr(block, name), strict=True):
+                spool.append(values.astype(STORED[name]).tobytes())
+    times_ns = np.concatenate(timestamps_ns)
     arrays = {
         "format": np.array(FORMAT),
-        "timestamps_ns": take.timestamps_ns,
-        "rate_hz": np.array(take.rate_hz),
-        "subject_names": np.array(take.subject_names, dtype=np.str_),
-        "skeleton": np.array(take.skeleton_name),
-        "bone_names": np.array(take.bone_names, dtype=np.str_),
-        "parents": np.array(take.parents, dtype=np.int64),
-        "heights_m": take.heights_m,
-        "offsets_m": take.offsets_m,
-        "theta": take.theta.astype(np.float32),
-        "bone_position_in_world_m": take.bone_position_in_world_m.astype(np.float32),
-        "bone_rotation_in_world_wxyz": take.bone_rotation_in_world_wxyz.astype(np.float32),
-        "tracked": take.tracked,
-        "bone_sigma_deg": take.bone_sigma_deg.astype(np.float16),
-        "position_sigma_m": take.position_sigma_m.astype(np.float16),
-        "provenance": np.array(json.dumps(take.provenance, sort_keys=True, default=str)),
+        "timestamps_ns": times_ns,
+        "rate_hz": np.array(nothing.rate_hz),
+        "subject_names": np.array(nothing.subject_names, dtype=np.str_),
+        "skeleton": np.array(nothing.skeleton_name),
+        "bone_names": np.array(nothing.bone_names, dtype=np.str_),
+        "parents": np.array(nothing.parents, dtype=np.int64),
+        "heights_m": nothing.heights_m,
+        "offsets_m": nothing.offsets_m,
+        "tracked": np.concatenate(tracked, axis=1),
+        "provenance": np.array(json.dumps(nothing.provenance, sort_keys=True, default=str)),
     }
-    with written_whole(Path(path)) as file:
-        np.savez(file, **arrays)
+    shapes = array_shapes(len(nothing.subject_names), len(times_ns), len(nothing.bone_names))
+    with written_whole(Path(path)) as file, zipfile.ZipFile(file, "w") as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
+                np.lib.format.write_array(entry, array, allow_pickle=False)
+        for name, spools in columns.items():
+            header = {
+                "descr": np.dtype(STORED[name]).str,
+                "fortran_order": False,
+                "shape": shapes[name],
+            }
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
+                np.lib.format.write_array_header_1_0(entry, header)
+                for spool in spools:
+                    for part in spool.parts():
+                        entry.write(part)
 
 
 def _wxyz_from_matrix(rotation: Float[np.ndarray, "t b 3 3"]) -> Float[np.ndarray, "t b 4"]:

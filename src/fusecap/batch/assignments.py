@@ -1,12 +1,11 @@
 """What sorting leaves for the second pass: who was given which keypoints, and a pose to begin with.
 
-On disk, in one temporary file, so that a take of hours needs no more memory than one of minutes;
-only names and states, a few bytes each, stay at hand.
+In a file once they are many, so that a take of hours needs no more memory than one of minutes; only
+names and states, a few bytes each, stay at hand.
 """
 
 from __future__ import annotations
 
-import tempfile
 from array import array
 from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
@@ -14,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from fusecap.files import Spool
 from fusecap.types import Estimate, Status, TrackState, TrackUpdate
 
 _STATES = tuple(TrackState)
@@ -54,7 +54,7 @@ class Assignments:
     """Written once, instant by instant; then ids and names are settled, and instants read."""
 
     def __init__(self, *, cameras: int, landmarks: int, pose_size: int) -> None:
-        self._file = tempfile.TemporaryFile(prefix="fusecap-")  # noqa: SIM115 - see `close`
+        self._spool = Spool()
         self._record = np.dtype(
             [
                 ("person", np.int32, (cameras,)),
@@ -83,10 +83,6 @@ class Assignments:
     def __len__(self) -> int:
         return len(self._first) - 1
 
-    def close(self) -> None:
-        """Give the disk back."""
-        self._file.close()
-
     def add(self, updates: Sequence[TrackUpdate], estimates: Sequence[Estimate]) -> None:
         """The next instant, as sorting and solving alone left it."""
         solved = {estimate.name: estimate for estimate in estimates}
@@ -108,7 +104,7 @@ class Assignments:
                 record["solve_s"] = estimate.solve_s
                 record["iterations"] = estimate.iterations
                 record["status"] = estimate.status.value
-        self._file.write(records.tobytes())
+        self._spool.append(records.tobytes())
         self._first.append(len(self._track))
 
     def landmarks_m(self, instant: int) -> dict[int, Float[np.ndarray, "k 3"]]:
@@ -178,9 +174,8 @@ class Assignments:
         return range(self._first[instant], self._first[instant + 1])
 
     def _read(self, rows: range) -> np.ndarray:
-        self._file.seek(rows.start * self._record.itemsize)
-        raw = self._file.read(len(rows) * self._record.itemsize)
-        return np.frombuffer(bytearray(raw), dtype=self._record)
+        size = self._record.itemsize
+        return np.frombuffer(self._spool.read(rows.start * size, len(rows) * size), self._record)
 
     def _assigned(self, row: int, record: np.void) -> Assigned:
         update = TrackUpdate(

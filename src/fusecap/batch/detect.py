@@ -393,7 +393,7 @@ class _Work:
 
     def summary(self) -> CameraSummary:
         frames = int(self.done.sum())
-        people: tuple[np.ndarray, ...] = ()
+        people: Sequence[np.ndarray] = ()
         if frames:
             people = read_keypoints(
                 self.camera.folder,

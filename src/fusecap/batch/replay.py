@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fusecap.batch.solve import Solved, SolveReport, describe_subjects
+from fusecap.batch.solve import Solved, SolveReport, SubjectSums
 from fusecap.body.shape import REFERENCE_HEIGHT_M, BodyShape
 from fusecap.engine.engine import Engine, LiveStep
 from fusecap.errors import InputError
@@ -23,7 +23,8 @@ from fusecap.recording.reader import RecordedEvent, RecordedPose, Recording
 from fusecap.recording.setup_json import setup_from_values
 from fusecap.setup import SessionSetup
 from fusecap.stored_take import load_take
-from fusecap.take import Take, TakeBuilder, provenance, take_from_theta
+from fusecap.take import Take, provenance, take_from_theta
+from fusecap.take_builder import TakeBuilder
 from fusecap.types import Estimate
 
 
@@ -78,10 +79,12 @@ def solve_as_live(recording: Recording, progress: Progress | None = None) -> tup
     started = time.perf_counter()
     again = Replay(recording)
     session = again.setup.session
+    names = [subject.name for subject in session.subjects]
+    subjects = SubjectSums(names)
     builder = TakeBuilder(
         skeleton=session.skeleton,
         rate_hz=session.settings.rate_hz,
-        subject_names=[subject.name for subject in session.subjects],
+        subject_names=names,
         provenance=provenance(
             options={"as_live": True, "cameras": list(again.setup.rig.names)},
             session_sha256=recording.sha256(),
@@ -93,19 +96,21 @@ def solve_as_live(recording: Recording, progress: Progress | None = None) -> tup
     interrupted = False
     try:
         for step in again.steps(progress):
-            builder.add(step.timestamp_ns, [one for one in step.people.values() if one is not None])
+            people = [one for one in step.people.values() if one is not None]
+            builder.add(step.timestamp_ns, people)
+            for one in people:
+                subjects.add(one)
             for estimate in step.step.estimates:
                 solve_s.append(estimate.solve_s)
                 statuses[estimate.status.name.lower()] += 1
     except KeyboardInterrupt:
         interrupted = True
-    take = builder.build()
     solve_ms = np.array(solve_s or [np.nan]) * 1e3
     report = SolveReport(
-        instants=len(take.timestamps_ns),
-        duration_s=len(take.timestamps_ns) / take.rate_hz,
+        instants=len(builder),
+        duration_s=len(builder) / session.settings.rate_hz,
         cameras=len(again.setup.rig),
-        subjects=describe_subjects(take),
+        subjects=subjects.as_report(len(builder)),
         reprojection_px={},
         solve_ms_median=float(np.median(solve_ms)),
         solve_ms_p99=float(np.percentile(solve_ms, 99)),
@@ -115,7 +120,7 @@ def solve_as_live(recording: Recording, progress: Progress | None = None) -> tup
         interrupted=interrupted,
         notes=(*loss_notes(recording), again.note()),
     )
-    return Solved(take=take, report=report), again
+    return Solved(builder=builder, report=report), again
 
 
 def recorded_take(recording: Recording, progress: Progress | None = None) -> Take:

@@ -15,8 +15,8 @@ import time
 from array import array
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import closing
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -25,16 +25,19 @@ import numpy as np
 from fusecap.batch.assignments import Assignments
 from fusecap.batch.second_pass import Instant, SecondPass
 from fusecap.batch.sorting import Instants, sort_instants
+from fusecap.body.shape import REFERENCE_HEIGHT_M
 from fusecap.checks import check_measurements
 from fusecap.errors import SessionError
 from fusecap.files import plain
 from fusecap.findings import Finding
 from fusecap.progress import Progress
 from fusecap.setup import Setup, setup_of
+from fusecap.solve.quantiles import Quantiles
 from fusecap.solve.reprojection import Reprojection
 from fusecap.sources.session_data import SessionData
-from fusecap.take import Take, TakeBuilder, provenance
-from fusecap.types import Detections, ImuReading
+from fusecap.take import Take, provenance
+from fusecap.take_builder import TakeBuilder
+from fusecap.types import Detections, Estimate, ImuReading, Status
 
 
 class SessionInstants:
@@ -87,10 +90,28 @@ class SolveReport:
 
 @dataclass(frozen=True, kw_only=True)
 class Solved:
-    """A take and how it came about."""
+    """A take, with a report in its provenance, and how it came about."""
 
-    take: Take
+    builder: TakeBuilder
     report: SolveReport
+
+    @cached_property
+    def take(self) -> Take:
+        """All of it in memory, which `save` does not need."""
+        return self.builder.build(self._provenance)
+
+    @property
+    def is_empty(self) -> bool:
+        """Nobody was followed."""
+        return not any(told["tracked_share"] for told in self.report.subjects.values())
+
+    def save(self, path: Path) -> None:
+        """The take as a file; raises `TakeError`."""
+        self.builder.save(path, self._provenance)
+
+    @property
+    def _provenance(self) -> dict[str, Any]:
+        return {**self.builder.provenance, "report": self.report.as_json()}
 
 
 def solve_session(
@@ -131,34 +152,20 @@ def solve_instants(
     notes: tuple[str, ...] = (),
 ) -> Solved:
     """Both passes over recorded instants."""
+    started = time.perf_counter()
     assigned = Assignments(
         cameras=len(setup.rig),
         landmarks=len(setup.landmarks.landmark_names),
         pose_size=setup.skeleton.pose_size,
     )
-    with closing(assigned):
-        return _both_passes(
-            setup, instants, assigned, progress, session_sha256, simulated=simulated, notes=notes
-        )
-
-
-def _both_passes(
-    setup: Setup,
-    instants: Instants,
-    assigned: Assignments,
-    progress: Progress | None,
-    session_sha256: str | None,
-    *,
-    simulated: bool,
-    notes: tuple[str, ...],
-) -> Solved:
-    started = time.perf_counter()
     tracked = sort_instants(setup, instants, assigned, progress)
     reprojection = Reprojection(setup.rig, setup.landmarks)
+    names = _in_order([model.name for model in setup.subjects], tracked.shapes)
+    subjects = SubjectSums(names)
     builder = TakeBuilder(
         skeleton=setup.skeleton,
         rate_hz=setup.rate_hz,
-        subject_names=_in_order([model.name for model in setup.subjects], tracked.shapes),
+        subject_names=names,
         provenance=provenance(
             options={"solver": asdict(setup.options), "cameras": list(setup.rig.names)},
             session_sha256=session_sha256,
@@ -174,6 +181,7 @@ def _both_passes(
             people = instant.people.values()
             builder.add(instant.timestamp_ns, [estimate for estimate, _ in people])
             for estimate, observation in people:
+                subjects.add(estimate)
                 reprojection.add(estimate, observation.keypoints)
 
     try:
@@ -189,15 +197,14 @@ def _both_passes(
     except KeyboardInterrupt:
         interrupted = True
     keep(second.rest())
-    take = builder.build()
     solve_ms = np.array(solve_s or [np.nan]) * 1e3
     return Solved(
-        take=take,
+        builder=builder,
         report=SolveReport(
-            instants=len(take.timestamps_ns),
-            duration_s=len(take.timestamps_ns) / setup.rate_hz,
+            instants=len(builder),
+            duration_s=len(builder) / setup.rate_hz,
             cameras=len(setup.rig),
-            subjects=describe_subjects(take),
+            subjects=subjects.as_report(len(builder)),
             reprojection_px=reprojection.summary(),
             solve_ms_median=float(np.median(solve_ms)),
             solve_ms_p99=float(np.percentile(solve_ms, 99)),
@@ -205,16 +212,16 @@ def _both_passes(
             statuses=dict(statuses),
             elapsed_s=time.perf_counter() - started,
             interrupted=interrupted,
-            notes=(*notes, *tracked.notes, *_small_people(take)),
+            notes=(*notes, *tracked.notes, *_small_people(subjects.heights_m)),
         ),
     )
 
 
-def _small_people(take: Take) -> list[str]:
+def _small_people(heights_m: Mapping[str, float]) -> list[str]:
     return [
         f"{name}: {height_m:.2f} m tall; people under {SMALL_M} m are followed with gaps and "
         "measured up to 5 % off: state height_m, or check the calibration's scale"
-        for name, height_m in zip(take.subject_names, take.heights_m, strict=True)
+        for name, height_m in heights_m.items()
         if height_m < SMALL_M
     ]
 
@@ -224,17 +231,41 @@ def _in_order(named: list[str], found: Collection[str]) -> list[str]:
     return named + sorted(set(found) - set(named), key=lambda name: (len(name), name))
 
 
-def describe_subjects(take: Take) -> dict[str, dict[str, float]]:
-    """As `SolveReport.subjects`."""
-    return {name: _describe(take, s) for s, name in enumerate(take.subject_names)}
+class SubjectSums:
+    """What a report says of everybody, while their poses come."""
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self._people = {name: _Sums() for name in names}
+
+    def add(self, estimate: Estimate) -> None:
+        """The next pose of somebody."""
+        sums = self._people.setdefault(estimate.name, _Sums())
+        sums.height_m = estimate.shape.height_m
+        if estimate.status is not Status.DIVERGED:
+            sums.tracked += 1
+            sums.turn_deg.add(estimate.bone_sigma_deg)
+            sums.place_m.add(estimate.position_sigma_m)
+
+    @property
+    def heights_m(self) -> dict[str, float]:
+        """Statures."""
+        return {name: sums.height_m for name, sums in self._people.items()}
+
+    def as_report(self, instants: int) -> dict[str, dict[str, float]]:
+        """As `SolveReport.subjects`."""
+        return {
+            name: {
+                "tracked_share": sums.tracked / max(instants, 1),
+                "bone_sigma_deg": sums.turn_deg.at(0.5),
+                "position_sigma_m": sums.place_m.at(0.5),
+                "height_m": sums.height_m,
+            }
+            for name, sums in self._people.items()
+        }
 
 
-def _describe(take: Take, subject: int) -> dict[str, float]:
-    tracked = take.tracked[subject]
-    turn, place = take.bone_sigma_deg[subject, tracked], take.position_sigma_m[subject, tracked]
-    return {
-        "tracked_share": float(tracked.mean()) if tracked.size else 0.0,
-        "bone_sigma_deg": float(np.median(turn)) if turn.size else float("nan"),
-        "position_sigma_m": float(np.median(place)) if place.size else float("nan"),
-        "height_m": float(take.heights_m[subject]),
-    }
+class _Sums:
+    def __init__(self) -> None:
+        self.height_m = REFERENCE_HEIGHT_M
+        self.tracked = 0
+        self.turn_deg, self.place_m = Quantiles(), Quantiles()

@@ -17,6 +17,7 @@ from fusecap.findings import Findings
 from fusecap.geometry.camera import Rig
 from fusecap.sources import view_agreement
 from fusecap.sources.keypoint_files import KeypointTrack
+from fusecap.sources.people_store import changed
 from fusecap.sources.synchronizer import people_at
 
 SAMPLED_INSTANTS = 60
@@ -158,7 +159,8 @@ def _cause(views: ComparedViews, index: int, own_px: float, fast_px: float) -> s
     """The remedy for the one cause that leaves least, where any leaves little."""
     track = views.tracks[index]
     causes = [_shift(views, index, fast_px)]
-    mirrored = replace(track, people=tuple(p[:, track.landmarks.mirror] for p in track.people))
+    mirror = track.landmarks.mirror
+    mirrored = replace(track, people=changed(track.people, lambda people: people[:, mirror]))
     left_px = views.with_track(index, mirrored).own_px(index, views.times_s)
     causes.append(
         (
@@ -195,7 +197,8 @@ def _shift(views: ComparedViews, index: int, fast_px: float) -> tuple[float, str
 
 
 def _scaled(track: KeypointTrack, scale: float) -> KeypointTrack:
-    return replace(track, people=tuple(p * [scale, scale, 1.0] for p in track.people))
+    scales = [scale, scale, 1.0]
+    return replace(track, people=changed(track.people, lambda people: people * scales))
 
 
 def _resolution_remedy(views: ComparedViews, index: int, scale: float, left_px: float) -> str:

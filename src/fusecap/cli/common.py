@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,6 +19,7 @@ from fusecap.files import plain
 
 if TYPE_CHECKING:
     from fusecap.batch.solve import Solved
+    from fusecap.exports.take_files import TakeFile
     from fusecap.exports.take_format import ExportOptions
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object for machines.")]
@@ -111,38 +112,37 @@ def write_take(solved: Solved, path: Path, exports: Exports, *, picture: bool) -
     """
     from fusecap.exports.made_files import list_made
     from fusecap.exports.take_files import held_poses, plan_files
-    from fusecap.take import save_take
 
-    told = solved.report.as_json()
-    take = replace(solved.take, provenance={**solved.take.provenance, "report": told})
     if solved.report.interrupted:
         path = path.with_name(f"{path.stem}-interrupted{path.suffix}")
-    planned = plan_files(
-        take,
-        path.parent,
-        formats=exports.formats,
-        stem=path.stem,
-        unit=exports.unit,
-        rig=exports.rig,
-        options=exports.options,
-    )
-    save_take(take, path)
+    planned: list[TakeFile] = []
+    if exports.formats:
+        planned = plan_files(
+            solved.take,
+            path.parent,
+            formats=exports.formats,
+            stem=path.stem,
+            unit=exports.unit,
+            rig=exports.rig,
+            options=exports.options,
+        )
+    solved.save(path)
     files = [path]
-    frames = len(take.timestamps_ns)
+    frames = solved.report.instants
     image = path.with_suffix(".png")
     try:
         for file in planned:
-            file.write(take)
+            file.write(solved.take)
             files.append(file.path)
             list_made(path, files)
         if picture and frames:
             from fusecap.exports.plot import plot_take
 
-            plot_take(take, sorted({0, frames // 3, 2 * frames // 3, frames - 1}), image)
+            plot_take(solved.take, sorted({0, frames // 3, 2 * frames // 3, frames - 1}), image)
             files.append(image)
     finally:
         set_aside_earlier(path, files)
-    for text in held_poses(take, planned):
+    for text in held_poses(solved.take, planned) if planned else ():
         note(text)
     return files
 

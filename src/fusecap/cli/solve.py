@@ -203,7 +203,7 @@ def _solve_one(
     with progress(quiet=as_json) as show:
         data = open_session(loaded, show)
         solved = solve_session(data, progress=show, anyway=anyway)
-    if not solved.take.tracked.any():
+    if solved.is_empty:
         _stop_without_poses(solved, _nobody(solved.report))
     seen = ExportOptions(cameras=data.rig, landmarks=data.landmarks)
     files = write_take(
@@ -240,7 +240,7 @@ def _solve_recording(
             replay = {"replay": {"poses": again.poses, "equal": again.equal}}
         else:
             solved = solve_recording(recording, progress=show, anyway=anyway)
-    if not solved.take.tracked.any():
+    if solved.is_empty:
         _stop_without_poses(
             solved,
             f"nobody could be followed in {solved.report.instants} instants of {path}; nothing "

@@ -17,7 +17,8 @@ from fusecap.setup import Setup
 from fusecap.solve.estimator import SubjectModel
 from fusecap.solve.options import SolverOptions
 from fusecap.solve.pose_solver import ImuSites
-from fusecap.take import Take, TakeBuilder, provenance
+from fusecap.take import Take, provenance
+from fusecap.take_builder import TakeBuilder
 from fusecap.types import Detections, Estimate, ImuReading
 
 

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.body.pose import landmarks_in_world
 from fusecap.geometry.camera import Rig
+from fusecap.solve.quantiles import Quantiles
 from fusecap.types import Estimate
 
 _BATCH = 256
@@ -21,7 +22,7 @@ class Reprojection:
         self._landmarks = landmarks
         self._points: list[np.ndarray] = []
         self._keypoints: list[np.ndarray] = []
-        self._residual_px: list[list[np.ndarray]] = [[] for _ in rig.cameras]
+        self._residual_px = [Quantiles() for _ in rig.cameras]
 
     def add(self, estimate: Estimate, keypoints: Float[np.ndarray, "c k 3"]) -> None:
         """The keypoints that an estimate was solved from."""
@@ -41,16 +42,14 @@ class Reprojection:
     def summary(self) -> dict[str, dict[str, float]]:
         """Per camera the median and 90th percentile [px], and the number of keypoints."""
         self._flush()
-        result = {}
-        for camera, parts in zip(self._rig.cameras, self._residual_px, strict=True):
-            residual = np.concatenate(parts) if parts else np.zeros(0)
-            known = residual.size > 0
-            result[camera.name] = {
-                "median": float(np.median(residual)) if known else float("nan"),
-                "p90": float(np.percentile(residual, 90)) if known else float("nan"),
-                "keypoints": int(residual.size),
+        return {
+            camera.name: {
+                "median": residual.at(0.5),
+                "p90": residual.at(0.9),
+                "keypoints": residual.count,
             }
-        return result
+            for camera, residual in zip(self._rig.cameras, self._residual_px, strict=True)
+        }
 
     def _flush(self) -> None:
         if not self._points:
@@ -61,6 +60,6 @@ class Reprojection:
             seen = keypoints[:, index]
             used = seen[:, :, 2] > 0
             residual = np.linalg.norm(camera.project(points[used]) - seen[used][:, :2], axis=1)
-            self._residual_px[index].append(residual[np.isfinite(residual)].astype(np.float32))
+            self._residual_px[index].add(residual)
         self._points.clear()
         self._keypoints.clear()

@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 import os
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from fusecap.errors import InputError
 from fusecap.inputs import KEYPOINTS, read_bytes
 from fusecap.progress import Progress
 from fusecap.sources.detection_files import read_record
+from fusecap.sources.people_store import PeopleStore
 
 MAX_FRAME = 10**9
 """Longer numbers are dates or serials."""
@@ -53,7 +55,7 @@ class KeypointTrack:
     """Of its video's frames every so many were looked at, and numbered; `frames` counts these."""
     times_s: np.ndarray
     """(F,) on the session's clock: frame / rate, or the video's own time, + offset."""
-    people: tuple[np.ndarray, ...]
+    people: Sequence[np.ndarray]
     """Per frame (n, K, 3): x [px], y [px], confidence 0-1; NaN, NaN, 0 where missing."""
     broken: tuple[str, ...]
     """Names of unreadable files, taken as frames without people."""
@@ -80,7 +82,7 @@ def read_keypoints(
     of another format; a broken file among good ones counts as a frame without people.
     """
     numbered = _numbered_files(folder)
-    people: list[np.ndarray] = []
+    people = PeopleStore(len(landmarks.landmark_names))
     broken: list[str] = []
     for done, (_, path) in enumerate(numbered, start=1):
         try:
@@ -113,7 +115,7 @@ def read_keypoints(
         frames=frames // step,
         step=step,
         times_s=times_s + offset_s,
-        people=tuple(people),
+        people=people,
         broken=tuple(broken),
     )
 

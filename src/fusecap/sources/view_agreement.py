@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -17,6 +18,7 @@ from scipy.optimize import linear_sum_assignment
 from fusecap.geometry.camera import Camera, Rig
 from fusecap.geometry.epipolar import essential_matrix
 from fusecap.sources.keypoint_files import KeypointTrack
+from fusecap.sources.people_store import changed
 from fusecap.sources.synchronizer import people_at
 
 MIN_CONFIDENCE = 0.3
@@ -32,13 +34,15 @@ def without_distortion(
     cameras = [replace(camera, distortion=np.zeros(5)) for camera in rig.cameras]
     ideal = []
     for camera, track in zip(rig.cameras, tracks, strict=True):
-        everyone = np.concatenate(track.people)
-        flat = camera.undistort(everyone[:, :, :2].reshape(-1, 2))
-        pixels = flat * [camera.matrix[0, 0], camera.matrix[1, 1]] + camera.matrix[:2, 2]
-        everyone = np.concatenate([pixels.reshape(*everyone.shape[:2], 2), everyone[:, :, 2:]], 2)
-        ends = np.cumsum([len(people) for people in track.people])
-        ideal.append(replace(track, people=tuple(np.split(everyone, ends[:-1]))))
+        flat = changed(track.people, partial(_through_ideal_lens, camera))
+        ideal.append(replace(track, people=flat))
     return Rig(cameras=tuple(cameras)), ideal
+
+
+def _through_ideal_lens(camera: Camera, people: np.ndarray) -> np.ndarray:
+    flat = camera.undistort(people[:, :, :2].reshape(-1, 2))
+    pixels = flat * [camera.matrix[0, 0], camera.matrix[1, 1]] + camera.matrix[:2, 2]
+    return np.concatenate([pixels.reshape(*people.shape[:2], 2), people[:, :, 2:]], 2)
 
 
 def pair_distances_px(
