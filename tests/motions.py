@@ -10,6 +10,8 @@ from fusecap.batch.solve import Solved, SolveReport
 from fusecap.body.shape import BodyShape
 from fusecap.body.skeleton import PAPER21, Skeleton
 from fusecap.take import Take, take_from_theta
+from fusecap.take_builder import TakeBuilder
+from fusecap.types import Estimate, Status
 
 
 def walk(
@@ -76,4 +78,36 @@ def solved(take: Take, **told: Any) -> Solved:
         "elapsed_s": 3.0,
         "interrupted": False,
     }
-    return Solved(take=take, report=SolveReport(**(report | told)))
+    builder = TakeBuilder(
+        skeleton=take.skeleton,
+        rate_hz=take.rate_hz,
+        subject_names=take.subject_names,
+        provenance=take.provenance,
+    )
+    for frame, timestamp_ns in enumerate(take.timestamps_ns.tolist()):
+        builder.add(timestamp_ns, [_estimate(take, row, frame) for row in _tracked(take, frame)])
+    return Solved(builder=builder, report=SolveReport(**(report | told)))
+
+
+def _tracked(take: Take, frame: int) -> list[int]:
+    return np.flatnonzero(take.tracked[:, frame]).tolist()
+
+
+def _estimate(take: Take, row: int, frame: int) -> Estimate:
+    bones = len(take.bone_names)
+    return Estimate(
+        track_id=row,
+        name=take.subject_names[row],
+        timestamp_ns=int(take.timestamps_ns[frame]),
+        theta=take.theta[row, frame],
+        bone_position_in_world_m=take.bone_position_in_world_m[row, frame],
+        bone_rotation_in_world=np.zeros((bones, 3, 3)),
+        bone_sigma_deg=take.bone_sigma_deg[row, frame],
+        position_sigma_m=take.position_sigma_m[row, frame],
+        shape=take.shape(row),
+        status=Status.CONVERGED,
+        iterations=1,
+        cost=0.0,
+        solve_s=0.0,
+        views=np.zeros(0, dtype=bool),
+    )

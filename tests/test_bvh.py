@@ -373,10 +373,10 @@ def test_a_take_that_cannot_be_written_leaves_everything_as_it_was(tmp_path, mon
     solved_again(two_people(), target, "bvh", "html")
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
 
-    def fails(take, path):
+    def fails(nothing, blocks, path):
         raise TakeError("the disk is full")
 
-    monkeypatch.setattr("fusecap.take.save_take", fails)
+    monkeypatch.setattr("fusecap.take_builder.save_blocks", fails)
     with pytest.raises(TakeError, match="disk is full"):
         solved_again(two_people(names=("anna", "carl")), target, "csv")
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
