@@ -68,6 +68,17 @@ def test_a_late_sensor_is_told_its_offset(folder):
     assert float(re.search(r"add about ([+-][\d.]+) s", only)[1]) == pytest.approx(-0.5, abs=0.1)
 
 
+def test_a_sensor_that_stopped_is_told_when(folder):
+    path = folder / "imus" / "ben_right_thigh.csv"
+    lines = path.read_text().splitlines()
+    cells = lines[91].split(",", 1)[1]
+    stopped = [f"{line.split(',', 1)[0]},{cells}" for line in lines[91:]]
+    path.write_text("\n".join(lines[:91] + stopped) + "\n")
+    assert any(
+        "imu 'right_thigh' of 'ben': says the same for 1.5 s" in text for text in said(folder)
+    )
+
+
 def test_a_sensor_that_slipped_is_told(folder):
     path = folder / "session.toml"
     text = path.read_text()

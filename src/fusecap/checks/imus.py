@@ -14,6 +14,8 @@ from fusecap.sources.session import ImuSettings, Session
 from fusecap.sources.session_sensors import mount
 from fusecap.types import GRAVITY_M_S2
 
+FROZEN_S = 0.5
+
 
 def check_imus(
     session: Session, tracks: Mapping[str, Sequence[ImuTrack | None]], findings: Findings
@@ -63,6 +65,7 @@ def _check_imu(where: str, imu: ImuSettings, track: ImuTrack, findings: Findings
             f"samples come at {track.rate_hz:.1f} Hz",
             "record at 60 Hz or more; below 20 Hz fast motion is lost",
         )
+    _check_frozen(where, track, findings)
     if not track.heading_known and "heading_deg" not in imu.model_fields_set:
         findings.add(
             "error",
@@ -72,6 +75,26 @@ def _check_imu(where: str, imu: ImuSettings, track: ImuTrack, findings: Findings
             "fusecap calibrate imu finds heading_deg from motion the cameras saw; or state it",
         )
     _check_gravity(where, imu, track, findings)
+
+
+def _check_frozen(where: str, track: ImuTrack, findings: Findings) -> None:
+    """No sensor that measures says the same twice for long, however still it lies."""
+    samples = np.concatenate([track.orientation_wxyz, np.nan_to_num(track.accel_m_s2)], axis=1)
+    changes = np.flatnonzero((np.diff(samples, axis=0) != 0).any(axis=1)) + 1
+    if len(changes) == 0:
+        return
+    first = np.concatenate([[0], changes])
+    last = np.concatenate([changes, [len(samples)]]) - 1
+    lasts_s = track.times_s[last] - track.times_s[first]
+    longest = int(np.argmax(lasts_s))
+    if lasts_s[longest] > FROZEN_S:
+        findings.add(
+            "warning",
+            where,
+            f"says the same for {lasts_s[longest]:.1f} s from "
+            f"{track.times_s[first[longest]]:.1f} s on, to the last digit",
+            "the sensor or its radio had stopped: take these rows out",
+        )
 
 
 def _check_gravity(where: str, imu: ImuSettings, track: ImuTrack, findings: Findings) -> None:

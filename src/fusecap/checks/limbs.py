@@ -32,6 +32,8 @@ LEAST_GAIN_RAD, LEAST_GAIN_ALONE_RAD = np.radians(3.0), np.radians(6.0)
 """Of all sensors of a person, of one: less is within what bodies and landmarks differ by."""
 LEAST_INSTANTS = 10
 SHIFTS_S = np.arange(-30, 31) * 0.05
+NEAR_S = SHIFTS_S[np.abs(SHIFTS_S) < 0.625]
+"""Of one sensor alone: who walks does the same a second later."""
 RATES = (0.5, 0.6, 5 / 6, 1.2, 5 / 3, 2.0)
 """Of what was recorded at one rate and written down as another."""
 SURER = 0.7
@@ -123,7 +125,7 @@ def check_limbs(
                     times_s=worn.times_s,
                     rest=worn.rest[mine],
                     own=own[:, mine],
-                    shifted=shifted[:, :, mine],
+                    shifted=shifted[np.isin(SHIFTS_S, NEAR_S)][:, :, mine],
                     apart_rad=float(apart[index]),
                 )
             )
@@ -182,7 +184,7 @@ def _together(
     def left(turned: np.ndarray) -> float:
         return _median(worn.per_sensor(worn.own(turned), turned))
 
-    causes = _late([left(late) for late in shifted], "their")
+    causes = _late(SHIFTS_S, [left(late) for late in shifted], "their")
     for heading in HEADINGS_RAD.tolist():
         left_rad = left(_about_up(heading, turned))
         causes.append((left_rad, _heading_remedy(heading, left_rad)))
@@ -225,7 +227,7 @@ class _Sensor:
 
 
 def _check_one(sensor: _Sensor, findings: Findings) -> None:
-    late = _late([sensor.left(turned) for turned in sensor.shifted], "its")
+    late = _late(NEAR_S, [sensor.left(turned) for turned in sensor.shifted], "its")
     if late and _explains(late[0][0], sensor.apart_rad, LEAST_GAIN_ALONE_RAD):
         remedy = late[0][1]
     elif sensor.apart_rad > APART_RAD:
@@ -251,12 +253,14 @@ def _about_up(heading_rad: float, turned: np.ndarray) -> np.ndarray:
     return turned @ Rotation.from_euler("y", heading_rad).as_matrix().T
 
 
-def _late(left_rad: list[float], whose: str) -> list[tuple[float, str]]:
+def _late(
+    shifts_s: Float[np.ndarray, " s"], left_rad: list[float], whose: str
+) -> list[tuple[float, str]]:
     """The shift that leaves least, where it is not one at the end of what is tried."""
     best = int(np.argmin(left_rad))
-    if best in (0, len(SHIFTS_S) - 1):
+    if best in (0, len(shifts_s) - 1):
         return []
-    return [(left_rad[best], _shift_remedy(SHIFTS_S[best], left_rad[best], whose))]
+    return [(left_rad[best], _shift_remedy(shifts_s[best], left_rad[best], whose))]
 
 
 def _shift_remedy(shift_s: float, left_rad: float, whose: str) -> str:
