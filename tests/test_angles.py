@@ -10,9 +10,11 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 import fusecap
+from angle_signs import MORE_DEG, figures
 from export_people import two_walkers, with_gap
 from fusecap.angles.gait import gait_cycles
 from fusecap.angles.joint_angles import ANY_ANGLE_SD_DEG, joint_angles
+from fusecap.angles.joints import JOINTS
 from fusecap.body.skeleton import EXTENDED23, PAPER21
 from fusecap.cli import app
 from fusecap.errors import InputError, TakeError
@@ -69,6 +71,16 @@ def test_a_joint_turned_alone_has_that_angle_and_its_sign(
     joint = name.split("_")[0]
     others = [n for n in found.names if n.startswith(f"{side}_{joint}") and n != f"{side}_{name}"]
     assert [found.curve("a", other)[0][0] for other in others] == pytest.approx([0, 0], abs=1e-6)
+
+
+@pytest.mark.parametrize("joint", JOINTS, ids=lambda joint: joint.name)
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_figures_of_the_picture_differ_by_what_it_says(joint, place):
+    before, after = (joint_angles(take) for take in figures(joint, place))
+    side = "right_" if joint.sided else ""
+    columns = [before.names.index(f"{side}{joint.name}_{angle}") for angle in joint.angles]
+    apart = (after.deg - before.deg)[0, 0, columns]
+    np.testing.assert_allclose(apart, np.eye(3)[place] * MORE_DEG[place], atol=1e-6)
 
 
 @pytest.mark.parametrize(
