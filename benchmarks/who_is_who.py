@@ -16,18 +16,18 @@ from dataclasses import replace
 import numpy as np
 
 from fusecap.associate.tracker import Tracker
+from fusecap.evaluate.close_groups import with_losses
 from fusecap.evaluate.score import score_take
 from fusecap.evaluate.simulated_solve import setup_of_simulation, solve_simulation
 from fusecap.evaluate.simulator import Simulation
 from fusecap.evaluate.twin import GROUPS, twin_group_simulation
 from fusecap.pipeline import Pipeline
 from fusecap.solve.options import SolverOptions
-from fusecap.types import Detections
 
 CAMERAS = (4, 8)
 FORCED_AT_S = 4.0
-LOSS, STRETCH = 0.3, 30
-"""Share of stretches, and their length in frames."""
+LOSS = 0.3
+"""Share of half-second stretches."""
 
 
 def main() -> None:
@@ -43,7 +43,7 @@ def main() -> None:
         for cameras in CAMERAS:
             for imus in (13, 0):
                 simulation = twin_group_simulation(group, cameras=cameras, imus=imus)
-                take = solve_simulation(with_losses(simulation, seed=1)).take
+                take = solve_simulation(with_losses(simulation, share=LOSS, seed=1)).take
                 score = score_take(take, simulation.truth, gate_m=0.5)
                 print(
                     f"{group}, {cameras} cameras, {imus} sensors, {LOSS:.0%} lost: IDF1 "
@@ -86,23 +86,6 @@ def exchange(pipeline: Pipeline) -> None:
     one.track_id, other.track_id = other.track_id, one.track_id
     for place in (first, second):
         pipeline._estimators.pop(place.name, None)
-
-
-def with_losses(simulation: Simulation, *, seed: int) -> Simulation:
-    rng = np.random.default_rng(seed)
-    stretches = len(simulation.detections) // STRETCH + 1
-    gone = rng.random((len(simulation.views), len(simulation.people), stretches)) < LOSS
-    lossy = []
-    for instant, detections in enumerate(simulation.detections):
-        people = []
-        for camera, found in enumerate(detections.people):
-            who = simulation.detected_person[instant][camera]
-            kept = [w < 0 or not gone[camera, w, instant // STRETCH] for w in who]
-            people.append(found[np.array(kept, dtype=bool)])
-        lossy.append(Detections(timestamp_ns=detections.timestamp_ns, people=tuple(people)))
-    other = replace(simulation)
-    other.__dict__["detections"] = tuple(lossy)
-    return other
 
 
 if __name__ == "__main__":

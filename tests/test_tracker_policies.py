@@ -218,6 +218,45 @@ def test_bystander_keeps_a_detection_that_fits_it_better_than_the_subject():
     assert update.track_id == subject.track_id and update.state is TrackState.COASTING
 
 
+# ------------------------------------------------------------------------------------------- jump
+
+
+def test_subject_whose_track_jumped_onto_somebody_else_is_who_goes_on_where_it_was():
+    stage = Stage(Tracker(RIG, BODY25))
+    (before,) = stage.hold(0.5, SOMEBODY)
+    beside = aside(*0.45 * BESIDE)
+    (jumped,) = stage.hold(0.2, beside)
+    assert jumped.track_id == before.track_id
+    notes, since_ns = [], None
+    for _ in range(15):
+        updates = stage.show(SOMEBODY, beside)
+        notes += stage.tracker.notes
+        since_ns = since_ns or stage.tracker.renumbered_since_ns
+    by_id = {update.track_id: update for update in updates}
+    np.testing.assert_array_equal(by_id[before.track_id].person, 0)
+    assert len(by_id) == 2 and all(u.state is TrackState.CONFIRMED for u in updates)
+    assert len(notes) == 1 and "somebody else than was followed" in notes[0]
+    assert since_ns == round(0.5 * 1e9), "the first instant of the jump"
+
+
+def test_subject_who_did_jump_stays_when_somebody_comes_elsewhere():
+    stage = Stage(Tracker(RIG, BODY25))
+    (before,) = stage.hold(0.5, SOMEBODY)
+    stage.hold(0.2, aside(*0.45 * BESIDE))
+    updates = stage.hold(0.5, aside(*0.45 * BESIDE), aside(*-0.45 * BESIDE))
+    by_id = {update.track_id: update for update in updates}
+    np.testing.assert_array_equal(by_id[before.track_id].person, 0)
+
+
+def test_depth_that_a_solve_guessed_of_one_view_leads_no_track_away():
+    stage = Stage(Tracker(RIG, BODY25))
+    (before,) = stage.hold(0.5, SOMEBODY)
+    stage.show(SOMEBODY, unseen_by=(0, 1, 3))
+    astray = {before.track_id: aside(*1.5 * BESIDE)}
+    (update,) = stage.show(SOMEBODY, predicted=astray)
+    np.testing.assert_array_equal(update.person, 0)
+
+
 # ------------------------------------------------------------------------------------- one camera
 
 

@@ -77,6 +77,8 @@ class Step:
     renumbered: Mapping[int, int] = field(default_factory=dict)
     """Of people who turned out to be others than was thought: by the track id they had until now
     the one that they have."""
+    renumbered_since_ns: int | None = None
+    """When these went astray; None where sensors' readings must tell."""
     bystanders: tuple[TrackUpdate, ...] = ()
     """Who is no subject but may be one of those who wear sensors."""
     notes: tuple[str, ...] = ()
@@ -194,6 +196,7 @@ class Pipeline:
             updates=tuple(updates),
             estimates=tuple(estimate for estimate in results if estimate is not None),
             renumbered=tracker.renumbered if tracker else {},
+            renumbered_since_ns=tracker.renumbered_since_ns if tracker else None,
             bystanders=tuple(tracker.bystanders) if tracker else (),
             notes=tuple(tracker.notes) if tracker else (),
         )

@@ -43,7 +43,7 @@ class Population:
         for row, t in enumerate(unseen):
             track = self.tracks[t]
             reach = o.reach_m + o.reach_speed_m_s * (now_ns - track.triangulated_ns) * 1e-9
-            expected = self._anatomy.centre(track.predict(now_ns, None))
+            expected = self._anatomy.centre(track.predict(now_ns))
             for column, centre in enumerate(centres):
                 away = float(np.linalg.norm(centre - expected))
                 misfit = size_misfit(track.limb_lengths_m(), limbs[column])

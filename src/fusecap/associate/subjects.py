@@ -177,6 +177,37 @@ class Cast:
             track.track_id = renumbered[track.track_id]
         return renumbered
 
+    def return_to_way(
+        self, tracks: Sequence[Track], vote: SensorVote, now_ns: int
+    ) -> tuple[dict[int, int], int | None]:
+        """Follow whoever goes on where a subject was expected, not whom its track jumped to.
+
+        A track that left its way (`Track.fork`) may have been given somebody else's detections
+        while the subject had none; the subject then comes as a newcomer. Returns, by the id that a
+        track had, the one it has, and since when.
+        """
+        o, subjects = self._options, self.ids()
+        newcomers = [t for t in tracks if t.track_id not in subjects and self._may_enter(t, now_ns)]
+        for place in self._places:
+            track = place.track
+            if not place.live or track is None or track.fork is None:
+                continue
+            if vote.misfit(track, place.name, SOON_S) < FITS:
+                continue
+            fork, best = track.fork, None
+            nearest_m = fork.jump_m - o.candidates.consistency_m
+            for other in newcomers:
+                after_s = (other.born_ns - fork.at_ns) * 1e-9
+                away_m = fork.away_m(other.born_m, other.born_ns)
+                if 0.0 <= after_s <= o.doubt_s and away_m < nearest_m:
+                    best, nearest_m = other, away_m
+            if best is not None:
+                former, own = best.track_id, track.track_id
+                track.exchange(best)
+                place.track = best
+                return {former: own, own: former}, fork.at_ns
+        return {}, None
+
     def contradicted(self, vote: SensorVote, now_ns: int) -> list[str]:
         """Wearers whom their sensors have not fitted for `patience_s`; each is named once."""
         found = []
@@ -204,15 +235,7 @@ class Cast:
         for place in self._places:
             if place.name in vote.heard and (now_ns - self._begun_ns) * 1e-9 > o.patience_s:
                 place.start_m = None
-        newcomers = [
-            track
-            for track in tracks
-            if track.track_id not in subjects
-            and not track.dismissed
-            and track.seen_ns == now_ns
-            and track.is_established(o)
-            and self.inside(track)
-        ]
+        newcomers = [t for t in tracks if t.track_id not in subjects and self._may_enter(t, now_ns)]
         self.kept_out = []
         if not newcomers:
             return
@@ -288,7 +311,7 @@ class Cast:
         doubtful = lost.triangulated_ns < track.born_ns
         if track.is_other_than(lost) or (place.live and not doubtful):
             return np.inf
-        expected = self._anatomy.centre(lost.predict(track.born_ns, None))
+        expected = self._anatomy.centre(lost.predict(track.born_ns))
         away = np.nan_to_num(np.linalg.norm(track.born_m - expected))
         misfit = size_misfit(lost.limb_lengths_m(), track.limb_lengths_m())
         since_s = max(track.born_ns - lost.triangulated_ns, 0) * 1e-9
@@ -308,6 +331,15 @@ class Cast:
             track.becomes(place.track, everyone)
         place.track = track
         place.live = True
+
+    def _may_enter(self, track: Track, now_ns: int) -> bool:
+        """Whether somebody is there now who may become a subject."""
+        return (
+            not track.dismissed
+            and track.seen_ns == now_ns
+            and track.is_established(self._options)
+            and self.inside(track)
+        )
 
     def inside(self, track: Track) -> bool:
         """Whether the torso is over the capture volume; an unknown place is."""

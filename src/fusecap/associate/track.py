@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,6 +24,21 @@ FEW_VIEWS_APART = 0.2
 """What an instant counts in which one of the two rests on two views: these can be of two people."""
 
 
+class Fork(NamedTuple):
+    """Where a track left its way: either the person jumped, or somebody else is followed since."""
+
+    at_ns: int
+    expected_m: np.ndarray
+    """Torso (3,) as it would have gone on."""
+    velocity_m_s: np.ndarray
+    jump_m: float
+
+    def away_m(self, torso_m: np.ndarray, now_ns: int) -> float:
+        """How far a torso (3,) is from where the way would have led until `now_ns`."""
+        ahead_s = min((now_ns - self.at_ns) * 1e-9, EXTRAPOLATION_S)
+        return float(np.linalg.norm(torso_m - self.expected_m - ahead_s * self.velocity_m_s))
+
+
 class Track:
     """Landmarks with constant velocity, what was seen of them, and the body's measure."""
 
@@ -32,6 +48,7 @@ class Track:
         "born_m",
         "born_ns",
         "dismissed",
+        "fork",
         "frames",
         "landmarks",
         "limb_count",
@@ -46,6 +63,7 @@ class Track:
         "track_id",
         "triangulated_ns",
         "velocity",
+        "views",
     )
 
     def __init__(
@@ -83,12 +101,37 @@ class Track:
         """Whether another track turned out to be who this one was thought to be."""
         self.dismissed = False
         """Whether it was said not to be a subject."""
+        self.views = 0
+        """Of which it was given detections last."""
+        self.fork: Fork | None = None
+        """Its last jump."""
 
-    def predict(self, now_ns: int, solved: np.ndarray | None) -> np.ndarray:
-        """Landmarks [m] now: the solver's where it gives them, else extrapolated."""
+    def predict(
+        self, now_ns: int, solved: np.ndarray | None = None, reach_m: float = np.inf
+    ) -> np.ndarray:
+        """Landmarks [m] now: the solver's where it gives them, else extrapolated.
+
+        A pose of one view farther than `reach_m` from where the track can be is no prediction:
+        its depth is a guess.
+        """
         ahead_s = min((now_ns - self.time_ns) * 1e-9, EXTRAPOLATION_S)
         own = self.landmarks + self.velocity * ahead_s
-        return own if solved is None else np.where(np.isnan(solved), own, solved)
+        if solved is None or (self.views == 1 and median_apart_m(solved, own) > reach_m):
+            return own
+        return np.where(np.isnan(solved), own, solved)
+
+    def note_jump(
+        self, expected_m: np.ndarray, found_m: np.ndarray, now_ns: int, gate_m: float, keep_s: float
+    ) -> None:
+        """Remember where a torso (3,) was expected that is found more than `gate_m` away.
+
+        What is younger than `keep_s` stays: the way was left then.
+        """
+        jump_m = float(np.linalg.norm(found_m - expected_m))
+        if jump_m > gate_m and (self.fork is None or now_ns - self.fork.at_ns > keep_s * 1e9):
+            known = np.isfinite(self.velocity[:, 0])
+            velocity = self.velocity[known].mean(axis=0) if known.any() else np.zeros(3)
+            self.fork = Fork(now_ns, expected_m, velocity, jump_m)
 
     def restart(self, measured: np.ndarray, now_ns: int) -> None:
         """Begin anew where the person was found again."""
@@ -131,6 +174,14 @@ class Track:
                 met = max(other.beside[old], other.beside.get(self, 0.0))
                 other.beside[self] = self.beside[other] = met
 
+    def exchange(self, newcomer: Track) -> None:
+        """Give a newcomer identity and size; who is followed here since the fork is another."""
+        self.track_id, newcomer.track_id = newcomer.track_id, self.track_id
+        newcomer.limb_sum_m += self.limb_sum_m
+        newcomer.limb_count += self.limb_count
+        self.limb_sum_m, self.limb_count = self.limb_sum_m * 0.0, self.limb_count * 0.0
+        self.fork = newcomer.fork = None
+
     def is_established(self, options: TrackerOptions) -> bool:
         """Whether enough views saw it for long enough to be a person."""
         lasted_s = (self.triangulated_ns - self.born_ns) * 1e-9
@@ -142,6 +193,13 @@ class Track:
         """Mean limb lengths [m] (m,); NaN where never seen."""
         count = np.where(self.limb_count > 0, self.limb_count, np.nan)
         return self.limb_sum_m / count
+
+
+def median_apart_m(a: np.ndarray, b: np.ndarray) -> float:
+    """Median distance [m] of common landmarks of two skeletons (k, 3); NaN without any."""
+    away_m = np.linalg.norm(a - b, axis=1)
+    away_m = away_m[np.isfinite(away_m)]
+    return float(np.median(away_m)) if len(away_m) else np.nan
 
 
 def measure(tracks: Sequence[Track], limb_lengths_m: np.ndarray) -> None:

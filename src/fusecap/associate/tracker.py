@@ -35,7 +35,7 @@ from fusecap.associate.options import TrackerOptions
 from fusecap.associate.population import Population
 from fusecap.associate.sensor_vote import SensorVote
 from fusecap.associate.subjects import Cast, Subject
-from fusecap.associate.track import Track, absorb, measure, part
+from fusecap.associate.track import Track, absorb, measure, median_apart_m, part
 from fusecap.associate.views import MIN_COMMON, Views
 from fusecap.believable import believable_detections, believable_points, checked_moment
 from fusecap.body.landmarks import LandmarkSet
@@ -68,6 +68,8 @@ class Tracker:
         self._readings: Mapping[str, ImuReading] = {}
         self.renumbered: dict[int, int] = {}
         """Of tracks that sensors paired anew at the last instant, by the former id the new one."""
+        self.renumbered_since_ns: int | None = None
+        """When these went astray; None where sensors' readings must tell."""
         self.bystanders: list[TrackUpdate] = []
         """Of the last instant, where somebody wears sensors, whom they may still fit."""
         self.notes: list[str] = []
@@ -98,7 +100,8 @@ class Tracker:
         tracks = self._population.tracks
         expected = np.empty((len(tracks), *views.rays.shape[1:]))
         for t, track in enumerate(tracks):
-            expected[t] = track.predict(now_ns, predicted.get(track.track_id))
+            reach_m = self._reach_m(track, now_ns)
+            expected[t] = track.predict(now_ns, predicted.get(track.track_id), reach_m)
         free = np.ones(len(views.rays), dtype=bool)
         looking = int(self._looking.sum())
         person, measured = self._matcher.match(views, expected, self._young(), free, looking)
@@ -120,6 +123,8 @@ class Tracker:
         follow(self._rig, views, tracks, person, expected, now_ns)
         if self._single:
             person, measured = self._find_single(views, person, measured, expected, now_ns)
+        for track, views_of in zip(tracks, (person >= 0).sum(axis=1), strict=True):
+            track.views = int(views_of) or track.views
         elapsed_ns = 0 if self._last_ns is None else now_ns - self._last_ns
         self._population.forget(measured, self._cast.ids(), self._looking, elapsed_ns, now_ns)
         self._cast.forget(self._population.tracks, now_ns)
@@ -128,13 +133,14 @@ class Tracker:
         self._vote.hear(
             [tracks[row] for row in rows], measured[rows], self._readings, elapsed_ns * 1e-9
         )
+        self.renumbered, self.renumbered_since_ns = self._cast.return_to_way(
+            everyone, self._vote, now_ns
+        )
+        self.notes = self._renumbered_notes("somebody was found where they were going")
         self._cast.admit(everyone, now_ns, self._vote)
-        self.renumbered = self._cast.pair_anew(everyone, self._vote)
-        self.notes = [
-            f"{name} is somebody else than was followed: sensors say so"
-            for name, track in self._cast.followed()
-            if track.track_id in self.renumbered.values()
-        ]
+        if not self.renumbered:
+            self.renumbered = self._cast.pair_anew(everyone, self._vote)
+            self.notes = self._renumbered_notes("sensors say so")
         self.notes += [
             f"{name}: sensors and cameras contradict each other; either nobody who is seen wears "
             "these sensors, or their bones or headings are not as stated (fusecap calibrate imu)"
@@ -199,13 +205,15 @@ class Tracker:
         """Of few views, what lies where nobody can have gone is two people's, and nobody's then."""
         o, count = self._options, (person >= 0).sum(axis=1)
         for t in np.flatnonzero((count > 1) & (count < o.birth_views)):
-            away_m = np.linalg.norm(measured[t] - expected[t], axis=1)
-            away_m = away_m[np.isfinite(away_m)]
-            since_s = (now_ns - self._population.tracks[t].triangulated_ns) * 1e-9
-            reach_m = o.reach_m + o.reach_speed_m_s * since_s
-            if len(away_m) and float(np.median(away_m)) > reach_m:
+            reach_m = self._reach_m(self._population.tracks[t], now_ns)
+            if median_apart_m(measured[t], expected[t]) > reach_m:
                 free[person[t][person[t] >= 0]] = True
                 person[t], measured[t] = -1, np.nan
+
+    def _reach_m(self, track: Track, now_ns: int) -> float:
+        """How far from its prediction a track can be."""
+        since_s = (now_ns - track.triangulated_ns) * 1e-9
+        return self._options.reach_m + self._options.reach_speed_m_s * since_s
 
     def _absorb(
         self, person: np.ndarray, measured: np.ndarray, expected: np.ndarray, now_ns: int
@@ -216,6 +224,8 @@ class Tracker:
         moving = [self._population.tracks[t] for t in np.flatnonzero(agreed)]
         if not moving:
             return
+        for track, found, hoped in zip(moving, measured[agreed], expected[agreed], strict=True):
+            self._note_jump(track, hoped, found, now_ns)
         absorb(moving, measured[agreed], expected[agreed], now_ns)
         measure(moving, self._anatomy.limb_lengths(measured[agreed]))
         for track, views in zip(moving, count[agreed], strict=True):
@@ -224,6 +234,15 @@ class Tracker:
             centre = np.array([self._anatomy.centre(t.landmarks) for t in moving])
             enough = min(self._options.birth_views, int(self._looking.sum()))
             part(moving, count[agreed], centre, self._options.duplicate_m, enough)
+
+    def _note_jump(
+        self, track: Track, expected: np.ndarray, found: np.ndarray, now_ns: int
+    ) -> None:
+        centre, o = self._anatomy.centre, self._options
+        known = np.isfinite(found[:, 0]) & np.isfinite(expected[:, 0])
+        both = known[:, None]
+        hoped_m = centre(np.where(both, expected, np.nan))
+        track.note_jump(hoped_m, centre(np.where(both, found, np.nan)), now_ns, o.gate_m, o.doubt_s)
 
     def _count_frame(self, track: Track, views: int, now_ns: int) -> None:
         track.triangulated_ns = now_ns
@@ -269,6 +288,7 @@ class Tracker:
             person[t] = found[i].person
             measured[t] = found[i].landmarks_in_world_m
             track = self._population.tracks[t]
+            self._note_jump(track, track.predict(now_ns), measured[t], now_ns)
             track.restart(measured[t].copy(), now_ns)
             self._count_frame(track, int((person[t] >= 0).sum()), now_ns)
             taken.add(i)
@@ -321,6 +341,13 @@ class Tracker:
         """Whether sensors may still tell who a newcomer is."""
         age_s = (now_ns - track.born_ns) * 1e-9
         return bool(self._vote.heard) and age_s < self._options.patience_s
+
+    def _renumbered_notes(self, why: str) -> list[str]:
+        return [
+            f"{name} is somebody else than was followed: {why}"
+            for name, track in self._cast.followed()
+            if track.track_id in self.renumbered.values()
+        ]
 
     def _report(
         self, person: np.ndarray, measured: np.ndarray, tracks: list[Track], now_ns: int

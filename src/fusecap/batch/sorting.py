@@ -76,7 +76,15 @@ def sort_instants(
     for instant, step in moved:
         names = {u.track_id: u.name for u in step.updates if u.name}
         wearers = {i: names[i] for i in step.renumbered.values() if i in names}
-        since = _renumber_before(assigned, instant, step.renumbered, wearers, instants, vote)
+        since_ns = step.renumbered_since_ns
+        if since_ns is None:
+            since = _sensors_began(assigned, instant, step.renumbered, wearers, instants, vote)
+        else:
+            since = instant
+            while since and instants.detections(since - 1).timestamp_ns >= since_ns:
+                since -= 1
+        for row in range(since, instant):
+            assigned.renumber(row, step.renumbered)
         begun.setdefault(since, set()).update(wearers.values())
     assigned.settle()
     _drop_tails(assigned, instants)
@@ -88,7 +96,7 @@ def sort_instants(
     )
 
 
-def _renumber_before(
+def _sensors_began(
     assigned: Assignments,
     instant: int,
     renumbered: Mapping[int, int],
@@ -96,11 +104,10 @@ def _renumber_before(
     instants: Instants,
     vote: SensorVote,
 ) -> int:
-    """Who turned out at an instant to be somebody else was so before: back to when it began.
+    """When they began to be others, of whom sensors said so at an instant.
 
-    That is the instant from which the new ids, until then, fit the sensors better by most; it is
-    returned. `wearers` has names by the new ids. Of whoever had no track then it counts whether
-    the other one fits.
+    That is when the new ids, until then, fit the sensors better by most. `wearers` has names by
+    the new ids. Of whoever had no track then it counts whether the other one fits.
     """
     gain = most = 0.0
     since = instant
@@ -115,8 +122,6 @@ def _renumber_before(
                     gain += float(away[0] - (away[1] if former in points else FITS))
         if gain >= most:
             most, since = gain, row
-    for row in range(since, instant):
-        assigned.renumber(row, renumbered)
     return since
 
 

@@ -116,7 +116,7 @@ def twin_simulation(
 
     Fewer cameras or sensors see exactly what they see in the full capture of the same seed.
     """
-    return _left_out(_full_simulation(sequence, seed), cameras, imus)
+    return left_out(_full_simulation(sequence, seed), cameras, imus)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,7 +167,7 @@ def twin_group_simulation(
     """
     if name not in GROUPS:
         raise InputError(f"the twin has no scene '{name}'{nearest(name, GROUPS)}")
-    return _left_out(_full_group(name, seed), cameras, imus)
+    return left_out(_full_group(name, seed), cameras, imus)
 
 
 @lru_cache(maxsize=2)
@@ -175,13 +175,13 @@ def _full_group(name: str, seed: int) -> Simulation:
     motion = load_twin_motion()
     people = []
     for member in GROUPS[name]:
-        shape = _body(member.body)
+        shape = body_of(member.body)
         people.append(
             Person(
                 name=f"{member.body}b" if member.bystander else member.body,
                 shape=shape,
                 theta=placed(
-                    _on_body(motion, member.clip, shape),
+                    on_body(motion, member.clip, shape),
                     turn_rad=float(np.radians(member.turn_deg)),
                     centre_m=member.centre_m,
                 ),
@@ -189,7 +189,7 @@ def _full_group(name: str, seed: int) -> Simulation:
                 bystander=member.bystander,
             )
         )
-    return _captured(people, f"twin {name}", seed, rate_hz=motion.rate_hz, volume_m=VOLUME_M)
+    return captured(people, f"twin {name}", seed, rate_hz=motion.rate_hz, volume_m=VOLUME_M)
 
 
 @lru_cache(maxsize=2)
@@ -197,10 +197,10 @@ def _full_simulation(sequence: TwinSequence, seed: int) -> Simulation:
     person = Person(
         name=sequence.subject, shape=sequence.shape, theta=sequence.theta, imu_bones=IMUS_13
     )
-    return _captured([person], f"twin {sequence.key}", seed, rate_hz=sequence.rate_hz)
+    return captured([person], f"twin {sequence.key}", seed, rate_hz=sequence.rate_hz)
 
 
-def _captured(
+def captured(
     people: list[Person],
     name: str,
     seed: int,
@@ -208,6 +208,7 @@ def _captured(
     rate_hz: float,
     volume_m: tuple[float, float, float, float] | None = None,
 ) -> Simulation:
+    """Before the twin's cameras, with its faults."""
     return simulate(
         people,
         camera_ring(CAMERAS, radius_m=RING_RADIUS_M),
@@ -223,7 +224,8 @@ def _captured(
     )
 
 
-def _left_out(full: Simulation, cameras: int, imus: int) -> Simulation:
+def left_out(full: Simulation, cameras: int, imus: int) -> Simulation:
+    """With the first cameras of the ring, and 0, 6 or 13 sensors on everybody who wears any."""
     if not 0 <= cameras <= CAMERAS:
         raise InputError(f"the twin has 0 to {CAMERAS} cameras; {cameras} asked for")
     worn = {0: (), 6: IMUS_6, 13: IMUS_13}
@@ -238,14 +240,14 @@ def _sequences(heights_m: dict[str, float]) -> tuple[TwinSequence, ...]:
     for index, key in enumerate(motion.names):
         subject, _, name = key.partition(" ")
         if subject in heights_m:
-            shape = _body(subject)
+            shape = body_of(subject)
             found.append(
                 TwinSequence(
                     subject=subject,
                     name=name,
                     take=motion.takes[index],
                     shape=shape,
-                    theta=_on_body(motion, key, shape),
+                    theta=on_body(motion, key, shape),
                     rate_hz=motion.rate_hz,
                 )
             )
@@ -253,7 +255,7 @@ def _sequences(heights_m: dict[str, float]) -> tuple[TwinSequence, ...]:
 
 
 @cache
-def _body(subject: str) -> BodyShape:
+def body_of(subject: str) -> BodyShape:
     """A stature, with bones that deviate from its proportions."""
     names = (*HEIGHTS_M, *TRAINING_HEIGHTS_M)
     height_m = {**HEIGHTS_M, **TRAINING_HEIGHTS_M}[subject]
@@ -270,7 +272,7 @@ def _body(subject: str) -> BodyShape:
     return shape.with_lengths(lengths)
 
 
-def _on_body(motion: ShippedMotion, key: str, shape: BodyShape) -> Float[np.ndarray, "t 66"]:
+def on_body(motion: ShippedMotion, key: str, shape: BodyShape) -> Float[np.ndarray, "t 66"]:
     """A clip on a body: steps as long as its legs, its feet on the floor as they were."""
     theta = motion.theta[motion.names.index(key)]
     reference = BodyShape.from_height(PAPER21, REFERENCE_HEIGHT_M)
