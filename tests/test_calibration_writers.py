@@ -144,3 +144,34 @@ def test_unwritable_place_says_so(tmp_path):
     with pytest.raises(TakeError, match="cannot write"):
         write_rig(tmp_path / "file" / "rig.toml", ring())
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_easymocap_reads_back_from_the_folder_or_either_file(tmp_path):
+    rig = ring(3)
+    write_rig(tmp_path / "extri.yml", rig)
+    for path in (tmp_path, tmp_path / "extri.yml", tmp_path / "intri.yml"):
+        assert_same(load_rig(path), rig)
+
+
+def test_easymocap_as_its_own_scripts_write_it(tmp_path):
+    def matrix(key, rows, values):
+        data = ", ".join(map(str, values))
+        shape = f"  rows: {rows}\r\n  cols: {len(values) // rows}\r\n  dt: d\r\n"
+        return f"{key}: !!opencv-matrix\r\n{shape}  data: [{data}]\r\n"
+
+    head = '%YAML:1.0\r\n---\r\nnames:\r\n  - "01"\r\n'
+    intrinsics = head + matrix("K_01", 3, [900, 0, 640, 0, 910, 360, 0, 0, 1])
+    intrinsics += matrix("D_01", 1, [0.1, 0.02, 0, 0, 0])
+    (tmp_path / "intri.yml").write_text(intrinsics, newline="")
+    (tmp_path / "extri.yml").write_text(
+        head + matrix("R_01", 3, [0, 0.5, 0]) + matrix("T_01", 3, [0.1, 0.2, 3.0]), newline=""
+    )
+    with pytest.raises(CalibrationError, match="add W_01 and H_01"):
+        load_rig(tmp_path)
+    sized = intrinsics + "H_01: 720\r\nW_01: 1280\r\n"
+    (tmp_path / "intri.yml").write_text(sized, newline="")
+    (camera,) = load_rig(tmp_path).cameras
+    assert camera.name == "01" and camera.size_px == (1280, 720)
+    assert camera.distortion[:2].tolist() == [0.1, 0.02]
+    assert camera.translation.tolist() == [0.1, 0.2, 3.0]
+    assert np.allclose(Rotation.from_matrix(camera.rotation).as_rotvec(), [0, 0.5, 0])
