@@ -9,6 +9,7 @@ from pathlib import Path
 from random import Random
 
 import numpy as np
+from scipy.io import savemat
 
 from fusecap.body.landmarks import landmark_set_named
 from fusecap.body.prior import load_prior, save_prior
@@ -16,7 +17,7 @@ from fusecap.body.skeleton import PAPER21
 from fusecap.calibrate.cameras.board import read_board
 from fusecap.calibrate.cameras.board_views import read_grey, read_timestamps
 from fusecap.evaluate.datasets.safe_pickle import load_pickle
-from fusecap.evaluate.datasets.shelf import load_truth
+from fusecap.evaluate.datasets.shelf import load_truth, read_actors
 from fusecap.inputs import MOTION, read_text
 from fusecap.motion.files import motion_formats
 from fusecap.recording.reader import Recording
@@ -130,6 +131,10 @@ def seeds(folder: Path) -> dict[str, tuple[bytes, Read]]:
     )
     add("motion.bvh", bvh, read_bvh)
     add("gt.txt", "15 1\n1\n0\n" + " ".join(["1.0"] * 60), load_truth)
+    cells = np.empty((1, 2), dtype=object)
+    cells[:] = [[np.zeros((14, 3)), np.zeros((1, 1))]]
+    savemat(folder / "gt.mat", {"actor3D": cells})
+    add("gt.mat", (folder / "gt.mat").read_bytes(), read_actors)
     add("data.pkl", pickle.dumps({"a": np.arange(4.0), "b": [1, "x"]}, 2), load_pickle)
     for format, head, row in (
         ("csv", "time_s,qw,qx,qy,qz,ax,ay,az", "{t},1,0,0,0,0,9.8,0"),

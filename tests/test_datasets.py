@@ -13,7 +13,7 @@ from fusecap.body.pose import forward_kinematics
 from fusecap.body.skeleton import EXTENDED23, PAPER21
 from fusecap.cli import main
 from fusecap.errors import InputError
-from fusecap.evaluate.datasets import human36m, panoptic, shelf, total_capture
+from fusecap.evaluate.datasets import human36m, matlab, panoptic, shelf, total_capture
 from fusecap.evaluate.datasets.dip import load_dip
 from fusecap.evaluate.datasets.safe_pickle import load_pickle
 from fusecap.evaluate.datasets.score import mean_by_name, score_table, score_truth
@@ -263,6 +263,21 @@ def test_garbled_mat_file_is_refused(tmp_path):
         shelf.load_shelf_truth(tmp_path)
     write_actors(path, [[np.zeros((12, 3))] * 3])
     with pytest.raises(InputError, match=r"joints \(12, 3\), expected 14 x 3"):
+        shelf.load_shelf_truth(tmp_path)
+
+
+def test_a_mat_file_that_ends_its_reader_is_a_message(tmp_path, rng, monkeypatch):
+    path = tmp_path / "actorsGT.mat"
+    write_actors(path, [[rng.standard_normal((14, 3))]])
+    monkeypatch.setattr(matlab, "MOST_S", 0.01)
+    with pytest.raises(InputError, match=r"actorsGT\.mat: not read within"):
+        shelf.load_shelf_truth(tmp_path)
+    monkeypatch.undo()
+    dies = "import os, signal\nos.kill(os.getpid(), signal.SIGSEGV)\n"
+    (tmp_path / "scipy").mkdir()
+    (tmp_path / "scipy" / "__init__.py").write_text(dies)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    with pytest.raises(InputError, match=r"actorsGT\.mat: not a MATLAB 5 file, or damaged"):
         shelf.load_shelf_truth(tmp_path)
 
 

@@ -34,11 +34,11 @@ from jaxtyping import Float, Int
 from fusecap.body.landmarks import LANDMARKS, landmark_set_named
 from fusecap.errors import InputError
 from fusecap.evaluate.datasets.files import camera_at_centre, floats, text_of, unpacked
+from fusecap.evaluate.datasets.matlab import Cells, read_cells
 from fusecap.evaluate.datasets.recording import DatasetSequence, last_frame, read_views
 from fusecap.evaluate.metrics import correct_limbs, identity_switches, match_people
 from fusecap.evaluate.tables import Table
 from fusecap.geometry.camera import Y_UP_FROM_Z_UP, Rig
-from fusecap.inputs import DATASET, open_input
 from fusecap.sources.calibration_files import fields, load_rig
 from fusecap.take import Take
 
@@ -207,28 +207,18 @@ def load_truth(path: Path | str) -> ShelfTruth:
 
 def read_actors(path: Path) -> ShelfTruth:
     """`actor3D` of an `actorsGT.mat`; an actor without joints in a frame is not there."""
-    from scipy.io import loadmat
-
-    try:
-        with open_input(path, DATASET) as file:
-            data = loadmat(file)
-    except InputError:
-        raise
-    except Exception as error:  # SciPy's reader raises whatever garbage makes it stumble over
-        raise InputError(f"{path}: not a MATLAB 5 file, or cut short: {error}") from None
-    if "actor3D" not in data:
-        raise InputError(f"{path}: holds no actor3D; expected the joints of each actor")
-    actors = [_cells(_unwrapped(actor)) for actor in _cells(_unwrapped(data["actor3D"]))]
+    actors = [_opened(actor) for actor in _opened(read_cells(path, "actor3D"))]
     frames = max((len(actor) for actor in actors), default=0)
     points = np.full((len(actors), frames, 15, 3), np.nan)
     for row, actor in enumerate(actors):
         for frame, cell in enumerate(actor):
-            joints = _unwrapped(cell)
-            if joints.shape == (14, 3) and joints.dtype != object:
+            joints = _opened(cell)[0]
+            if isinstance(joints, np.ndarray) and joints.shape == (14, 3):
                 points[row, frame, :14] = joints @ Y_UP_FROM_Z_UP.T
-            elif joints.size > 1:
+            elif not isinstance(joints, np.ndarray) or joints.size > 1:
+                found = len(joints) if isinstance(joints, list) else joints.shape
                 raise InputError(
-                    f"{path}: actor {row} frame {frame} has joints {joints.shape}, expected 14 x 3"
+                    f"{path}: actor {row} frame {frame} has joints {found}, expected 14 x 3"
                 )
     points[:, :, MID_HIP] = (points[:, :, 2] + points[:, :, 3]) / 2
     return ShelfTruth(points_in_world_m=points)
@@ -325,14 +315,8 @@ def pcp_table(name: str, score: ShelfScore) -> Table:
     )
 
 
-def _unwrapped(value: Any) -> np.ndarray:
-    """MATLAB cells that hold a single cell, opened."""
-    array = np.asarray(value)
-    while array.dtype == object and array.size == 1:
-        array = np.asarray(array.reshape(-1)[0])
-    return array
-
-
-def _cells(array: np.ndarray) -> list[Any]:
-    """The elements of a cell array; a matrix of one frame is itself the only one."""
-    return list(array.reshape(-1)) if array.dtype == object else [array]
+def _opened(cells: Cells) -> list[Cells]:
+    """The cells, of cells that hold a single cell; a matrix of one frame is itself the only one."""
+    while isinstance(cells, list) and len(cells) == 1:
+        cells = cells[0]
+    return cells if isinstance(cells, list) else [cells]
