@@ -1,4 +1,5 @@
 import json
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -271,3 +272,13 @@ def test_shelf_folder_agrees_with_its_other_format(data_dir):
         centre_m = np.ravel(other[camera.name]["T"]) / 1000
         assert np.allclose(camera.position_in_world, centre_m, atol=2e-3)
         assert np.allclose(camera.rotation, other[camera.name]["R"], atol=1e-4)
+
+
+def test_thousands_of_cameras_are_refused_at_once(tmp_path):
+    one = calibration_toml(ring(1)).removeprefix("[cam0]")
+    path = tmp_path / "calibration.toml"
+    path.write_text("".join(f"[c{i}]{one}\n" for i in range(10_000)))
+    started_s = time.process_time()
+    with pytest.raises(CalibrationError, match="10000 cameras; at most 1024"):
+        load_rig(path)
+    assert time.process_time() - started_s < 10

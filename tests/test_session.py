@@ -1,3 +1,5 @@
+import time
+
 import numpy as np
 import pytest
 
@@ -17,6 +19,16 @@ def complaint(tmp_path, text):
         parse_session(tmp_path)
     assert "session.toml" in str(caught.value)
     return str(caught.value)
+
+
+@pytest.mark.parametrize(("table", "most"), [("camera", 256), ("subject", 64)])
+def test_tables_beyond_the_budget_are_refused_at_once(tmp_path, table, most):
+    keypoints = 'keypoints = "k"\n' if table == "camera" else ""
+    text = "".join(f'[[{table}]]\nname = "x{i}"\n{keypoints}' for i in range(20_000))
+    started_s = time.process_time()
+    found = complaint(tmp_path, CAMERA + text)
+    assert f"[[{table}]] tables; at most {most}" in found
+    assert time.process_time() - started_s < 5
 
 
 @pytest.mark.parametrize(

@@ -8,17 +8,21 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from fusecap.batch.solve import Solved, SolveReport, SubjectSums
 from fusecap.body.shape import REFERENCE_HEIGHT_M, BodyShape
+from fusecap.body.skeleton import Skeleton
 from fusecap.engine.engine import Engine, LiveStep
 from fusecap.errors import InputError
 from fusecap.progress import Progress
-from fusecap.recording.layout import SUFFIX, RecordedBody
+from fusecap.recording.index import RecordingIndex
+from fusecap.recording.layout import SUFFIX
 from fusecap.recording.reader import RecordedEvent, RecordedPose, Recording
 from fusecap.recording.setup_json import setup_from_values
 from fusecap.setup import SessionSetup
@@ -123,52 +127,95 @@ def solve_as_live(recording: Recording, progress: Progress | None = None) -> tup
     return Solved(builder=builder, report=report), again
 
 
-def recorded_take(recording: Recording, progress: Progress | None = None) -> Take:
-    """The poses as they were recorded, without solving again; raises `InputError` without any.
+class RecordedMotion:
+    """The poses of a run as they were sent, read from its recording as they are asked for.
 
-    A body that changed in the run has its last shape throughout.
+    A body that changed in the run has its last shape throughout. Raises `InputError` without any.
     """
-    setup = recorded_setup(recording)
-    session = setup.session
-    times_ns: list[int] = []
-    rows: dict[str, list[tuple[int, RecordedPose]]] = {s.name: [] for s in session.subjects}
-    shapes: dict[str, BodyShape] = {}
-    for item in recording.items(progress):
-        if isinstance(item, RecordedBody):
-            shapes[item.name] = item.shape
-        elif isinstance(item, RecordedPose):
-            if times_ns and item.timestamp_ns < times_ns[-1]:
-                continue
-            if not times_ns or item.timestamp_ns > times_ns[-1]:
-                times_ns.append(item.timestamp_ns)
-            if not item.diverged:
-                rows.setdefault(item.name, []).append((len(times_ns) - 1, item))
-    if not times_ns:
-        raise InputError(f"{recording.path} holds no pose; solve it with: fusecap solve")
-    skeleton = session.skeleton
-    reference = BodyShape.from_height(skeleton, REFERENCE_HEIGHT_M)
-    theta = np.full((len(rows), len(times_ns), skeleton.pose_size), np.nan)
-    turn, place = np.full((2, len(rows), len(times_ns), skeleton.bone_count), np.nan)
-    for subject, poses in enumerate(rows.values()):
-        for row, pose in poses:
-            theta[subject, row] = pose.theta
-            turn[subject, row] = pose.bone_sigma_deg
-            place[subject, row] = pose.position_sigma_m
-    return take_from_theta(
-        theta,
-        [shapes.get(name, reference) for name in rows],
-        timestamps_ns=np.array(times_ns, dtype=np.int64),
-        rate_hz=session.settings.rate_hz,
-        subject_names=tuple(rows),
-        skeleton=skeleton,
-        tracked=np.asarray(np.isfinite(theta).all(axis=2)),
-        bone_sigma_deg=turn,
-        position_sigma_m=place,
-        provenance=provenance(
-            options={"recorded": True, "cameras": list(setup.rig.names)},
-            simulated=setup.simulated,
-        ),
-    )
+
+    def __init__(self, recording: Recording, index: RecordingIndex) -> None:
+        self._index = index
+        self._setup = recorded_setup(recording)
+        session = self._setup.session
+        names = [subject.name for subject in session.subjects]
+        names += [name for name in index.poses if name not in names]
+        self.subject_names = tuple(names)
+        known = {name: np.array(index.poses[name].times_ns) for name in index.poses}
+        times_ns = np.unique(np.concatenate([*known.values(), np.empty(0, np.int64)]))
+        if len(times_ns) == 0:
+            raise InputError(f"{recording.path} holds no pose; solve it with: fusecap solve")
+        self.timestamps_ns: Int[np.ndarray, " t"] = times_ns
+        self._rows = np.full((len(names), len(times_ns)), -1, dtype=np.int32)
+        """Of each person's poses, the one at each instant; -1: none."""
+        for name, times in known.items():
+            self._rows[names.index(name), np.searchsorted(times_ns, times)] = np.arange(len(times))
+        reference = BodyShape.from_height(session.skeleton, REFERENCE_HEIGHT_M)
+        self._shapes = [index.bodies.get(name, reference) for name in names]
+
+    @property
+    def tracked(self) -> Bool[np.ndarray, "s t"]:
+        """Whose pose was sent; a diverged one is found when it is read."""
+        return np.asarray(self._rows >= 0)
+
+    @property
+    def time_s(self) -> Float[np.ndarray, " t"]:
+        """Seconds since the first frame."""
+        return (self.timestamps_ns - self.timestamps_ns[:1]) * 1e-9
+
+    @property
+    def heights_m(self) -> Float[np.ndarray, " s"]:
+        """Statures."""
+        return np.array([shape.height_m for shape in self._shapes])
+
+    @property
+    def skeleton(self) -> Skeleton:
+        """Everybody's."""
+        return self._setup.session.skeleton
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """What made the poses."""
+        return provenance(
+            options={"recorded": True, "cameras": list(self._setup.rig.names)},
+            simulated=self._setup.simulated,
+        )
+
+    def shape(self, subject: int) -> BodyShape:
+        """The body of one subject."""
+        return self._shapes[subject]
+
+    def at_frames(self, frames: Sequence[int] | Int[np.ndarray, " n"]) -> Take:
+        """These frames alone, which rise."""
+        frames = np.asarray(frames, dtype=np.int64)
+        people, count = len(self.subject_names), len(frames)
+        theta = np.full((people, count, self.skeleton.pose_size), np.nan)
+        turn, place = np.full((2, people, count, self.skeleton.bone_count), np.nan)
+        for at, frame in enumerate(frames):
+            for subject, name in enumerate(self.subject_names):
+                row = int(self._rows[subject, frame])
+                pose = self._index.read(self._index.poses[name], row) if row >= 0 else None
+                if isinstance(pose, RecordedPose) and not pose.diverged:
+                    theta[subject, at] = pose.theta
+                    turn[subject, at] = pose.bone_sigma_deg
+                    place[subject, at] = pose.position_sigma_m
+        return take_from_theta(
+            theta,
+            self._shapes,
+            timestamps_ns=self.timestamps_ns[frames],
+            rate_hz=self._setup.session.settings.rate_hz,
+            subject_names=self.subject_names,
+            skeleton=self.skeleton,
+            tracked=np.asarray(np.isfinite(theta).all(axis=2)),
+            bone_sigma_deg=turn,
+            position_sigma_m=place,
+            provenance=self.provenance,
+        )
+
+
+def recorded_take(recording: Recording, progress: Progress | None = None) -> Take:
+    """All poses as they were recorded, without solving again; raises `InputError` without any."""
+    motion = RecordedMotion(recording, RecordingIndex(recording, progress=progress))
+    return motion.at_frames(np.arange(len(motion.timestamps_ns)))
 
 
 def open_take(path: Path, progress: Progress | None = None) -> Take:

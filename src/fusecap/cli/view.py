@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fusecap.cli.common import Json, print_json
-from fusecap.cli.terminal import console, note
+from fusecap.cli.terminal import console, note, progress
 
 if TYPE_CHECKING:
     from fusecap.geometry.camera import Rig
-    from fusecap.take import Take
     from fusecap.viewer.curves import BoneCurve
     from fusecap.viewer.page import Page
     from fusecap.viewer.recording import RecordedDetections
@@ -63,7 +62,7 @@ def view(
 
     detections = None
     if take.suffix == SUFFIX:
-        loaded, detections = _recorded(take)
+        loaded, detections = _recorded(take, as_json)
     else:
         loaded = StoredTake(take)
         loaded.check()
@@ -140,18 +139,21 @@ def look(
             page.stop()
 
 
-def _recorded(path: Path) -> tuple[Take, RecordedDetections | None]:
+def _recorded(path: Path, quiet: bool) -> tuple[ViewedTake, RecordedDetections | None]:
     """The poses of a recording, and its detections where it has cameras."""
-    from fusecap.batch.replay import loss_notes, recorded_setup, recorded_take
+    from fusecap.batch.replay import RecordedMotion, loss_notes, recorded_setup
+    from fusecap.recording.index import RecordingIndex
     from fusecap.recording.reader import Recording
-    from fusecap.viewer.recording import RecordedDetections
+    from fusecap.viewer.recording import SHOWN_HZ, RecordedDetections
 
     recording = Recording(path)
-    take = recorded_take(recording)
+    with progress(quiet=quiet) as show:
+        index = RecordingIndex(recording, keypoints_hz=SHOWN_HZ, progress=show)
     for text in loss_notes(recording):
         note(text)
     setup = recorded_setup(recording)
-    return take, RecordedDetections(recording, setup) if len(setup.rig) else None
+    detections = RecordedDetections(index, setup) if len(setup.rig) else None
+    return RecordedMotion(recording, index), detections
 
 
 def _announce(page: Page, *, as_json: bool, browser: bool) -> None:

@@ -12,6 +12,7 @@ imaged, like one behind the camera.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -28,6 +29,10 @@ MOST, MOST_PX = 1e9, 1_000_000
 """Of any number of a camera, and of the sides of its picture."""
 PACKED_SIZE = 24
 """Length of `Camera.packed`: R (9), t (3), fx fy cx cy, k1 k2 p1 p2 k3, scale, r²max, 0."""
+
+
+MOST_CAMERAS = 1024
+"""Of a rig: pairs of them are compared."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,8 +146,12 @@ class Rig:
     cameras: tuple[Camera, ...]
 
     def __post_init__(self) -> None:
-        names = [camera.name for camera in self.cameras]
-        doubled = sorted({name for name in names if names.count(name) > 1})
+        if len(self.cameras) > MOST_CAMERAS:
+            raise CalibrationError(
+                f"{len(self.cameras)} cameras; at most {MOST_CAMERAS} are read: keep those in use"
+            )
+        counts = Counter(camera.name for camera in self.cameras)
+        doubled = sorted(name for name, count in counts.items() if count > 1)
         if doubled:
             raise CalibrationError(f"two cameras are called {', '.join(doubled)}")
 

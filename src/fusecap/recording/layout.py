@@ -27,6 +27,7 @@ HEADER, END = "fusecap", "fusecap end"
 """Names of the metadata records before and after the data."""
 KEYPOINTS, IMU = "fusecap.Keypoints", "fusecap.Imu"
 COMMAND, TICK = "fusecap.Command", "fusecap.Tick"
+EVENTS = frozenset({KEYPOINTS, IMU, COMMAND, TICK})
 POSE, BODY = "fusecap.Pose", "fusecap.Body"
 
 

@@ -3,7 +3,8 @@
 Reading goes from record to record and stops at the first that the file does not hold whole; a
 chunk that fails its checksum is left out. Events carry their number among all events, so whatever
 is missing is known. Nothing in a file is executed, and no length in it is believed beyond the size
-of the file, or 256 MiB for what a chunk unpacks to.
+of the file, or 256 MiB for what a chunk unpacks to; all chunks together may unpack to a hundred
+times the file.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from jaxtyping import Float
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Message, Metadata, Schema
+from mcap.records import Channel, Chunk, Metadata, Schema
 
 from fusecap.errors import InputError, MotionError
 from fusecap.inputs import RECORDING, open_input
@@ -34,8 +35,14 @@ from fusecap.types import Event
 
 MAX_BYTES = 256 << 20
 """Of one record, and of what a chunk unpacks to."""
+MAX_RATIO = 100
+"""Of what all chunks unpack to, `MAX_BYTES` aside, to the file; a run's is about 3."""
 _MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")
+_NAME = 1000
+"""Of a schema or a channel: so much is kept."""
+_MESSAGE = struct.Struct("<HIQQ")
+"""Channel, sequence, log time, publish time; the content follows."""
 _BROKEN = (
     ValueError,
     KeyError,
@@ -48,7 +55,21 @@ _BROKEN = (
 )
 """What parsing bytes that are not what they should be may raise."""
 
-_Record = Schema | Channel | Message | Metadata
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Entry:
+    """A message that has not been read yet."""
+
+    schema: str
+    topic: str
+    sequence: int
+    log_ns: int
+    publish_ns: int
+    record_at: int
+    """In the file: of the chunk that holds it, or of the message itself."""
+    start: int
+    """Of its content, in what the record unpacks to."""
+    content: memoryview
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -129,65 +150,90 @@ class Recording:
 
     def items(self, progress: Progress | None = None) -> Iterator[Item]:
         """Everything in the order in which it was recorded; `loss` counts what is not there."""
+        numbers = EventNumbers()
+        for entry in self.entries(progress, numbers):
+            item = self.read(entry, numbers)
+            if item is not None:
+                yield item
+        self.loss.missing_events = numbers.missing
+
+    def entries(
+        self, progress: Progress | None = None, numbers: EventNumbers | None = None
+    ) -> Iterator[Entry]:
+        """Every message, unread; `loss` counts what is not there.
+
+        Raises `InputError` for a file that unpacks to `MAX_RATIO` times its size.
+        """
         self.loss = loss = Loss()
-        schemas: dict[int, str] = {}
-        channels: dict[int, str] = {}
-        numbers = _Numbers()
+        said = _Said()
+        most = MAX_BYTES + MAX_RATIO * self.path.stat().st_size
+        unpacked = 0
         with self._opened() as file:
-            for opcode, payload in self._records(file, loss, progress):
+            for record_at, opcode, payload in self._records(file, loss, progress):
                 try:
-                    records = list(_inside(opcode, payload))
+                    data = unpacked_record(opcode, payload)
+                    unpacked += len(data)
+                    if unpacked > most:
+                        raise InputError(
+                            f"{self.path}: unpacks to more than {most} bytes, {MAX_RATIO} times "
+                            "its size; no run leaves such a recording"
+                        )
+                    for kind, at, end in _spans(opcode, data):
+                        if kind == Opcode.MESSAGE:
+                            yield said.entry(data, at, end, record_at)
+                        else:
+                            said.hear(kind, data[at:end])
                 except (*_BROKEN, zstandard.ZstdError, MemoryError):
                     loss.broken_chunks += 1
-                    continue
-                for record in records:
-                    match record:
-                        case Schema():
-                            schemas[record.id] = record.name
-                        case Channel():
-                            channels[record.id] = schemas.get(record.schema_id, "")
-                        case Metadata() if record.name == END:
-                            loss.note = record.metadata.get("note", "")
-                            events = record.metadata.get("events", "")
-                            if events.isdecimal() and len(events) < 19:
-                                numbers.state(int(events))
-                        case Message():
-                            item = self._item(channels.get(record.channel_id, ""), record, numbers)
-                            if item is not None:
-                                yield item
-        loss.missing_events = numbers.missing
+        loss.note = said.note
+        if numbers is not None:
+            numbers.state(said.events)
+
+    def read(self, entry: Entry, numbers: EventNumbers | None = None) -> Item | None:
+        """What a message says, None for one of another kind; what is malformed is counted."""
+        decode = DECODERS.get(entry.schema)
+        if decode is None:
+            self.loss.malformed += not entry.schema
+            return None
+        try:
+            decoded = decode(json.loads(bytes(entry.content)), self._known)
+            if isinstance(decoded, Event):
+                if numbers is not None:
+                    numbers.take(entry.sequence)
+                return RecordedEvent(
+                    event=decoded,
+                    number=entry.sequence,
+                    arrival_ns=entry.log_ns - self.unix_minus_session_ns,
+                )
+            if isinstance(decoded, RecordedBody):
+                return decoded
+            return RecordedPose(number=entry.sequence, **decoded)
+        except (*_BROKEN, MotionError, InputError):
+            self.loss.malformed += 1
+            return None
+
+    def unpacked(self, record_at: int) -> memoryview:
+        """The record that an entry names; empty where it is no longer there."""
+        with self._opened() as file:
+            file.seek(record_at)
+            head = file.read(_RECORD.size)
+            try:
+                opcode, length = _RECORD.unpack(head)
+                if length > MAX_BYTES:
+                    raise ValueError("a record that is too long")
+                return unpacked_record(opcode, file.read(length))
+            except (*_BROKEN, zstandard.ZstdError, MemoryError):
+                return memoryview(b"")
 
     def sha256(self) -> str:
         """Of the file."""
         with self._opened() as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
 
-    def _item(self, schema: str, message: Message, numbers: _Numbers) -> Item | None:
-        decode = DECODERS.get(schema)
-        if decode is None:
-            self.loss.malformed += not schema
-            return None
-        try:
-            values = json.loads(message.data)
-            decoded = decode(values, self._known)
-            if isinstance(decoded, Event):
-                numbers.take(message.sequence)
-                return RecordedEvent(
-                    event=decoded,
-                    number=message.sequence,
-                    arrival_ns=message.log_time - self.unix_minus_session_ns,
-                )
-            if isinstance(decoded, RecordedBody):
-                return decoded
-            return RecordedPose(number=message.sequence, **decoded)
-        except (*_BROKEN, MotionError, InputError):
-            self.loss.malformed += 1
-            return None
-
     def _header(self) -> dict[str, str]:
         with self._opened() as file:
             try:
-                for opcode, payload in self._records(file, Loss(), None):
+                for _, opcode, payload in self._records(file, Loss(), None):
                     if opcode == Opcode.METADATA:
                         record = Metadata.read(ReadDataStream(BytesIO(payload)))
                         if record.name == HEADER:
@@ -206,8 +252,8 @@ class Recording:
 
     def _records(
         self, file: BinaryIO, loss: Loss, progress: Progress | None
-    ) -> Iterator[tuple[int, bytes]]:
-        """Opcode and content of every record that is there whole, up to the end of the data."""
+    ) -> Iterator[tuple[int, int, bytes]]:
+        """Place, opcode and content of every record that is there whole, up to the data's end."""
         size = self.path.stat().st_size
         if file.read(len(_MAGIC)) != _MAGIC:
             raise InputError(f"{self.path} is not an MCAP log: its first bytes are others")
@@ -219,14 +265,55 @@ class Recording:
                 return
             if length > min(MAX_BYTES, size - at - _RECORD.size):
                 break
-            yield opcode, file.read(length)
+            yield at, opcode, file.read(length)
             at += _RECORD.size + length
             if progress is not None:
                 progress(f"reading {self.path.name}", at, size)
         loss.unread_bytes = size - at
 
 
-class _Numbers:
+class _Said:
+    """What the records between the messages say."""
+
+    def __init__(self) -> None:
+        self.note = ""
+        self.events = 0
+        self._schemas: dict[int, str] = {}
+        self._channels: dict[int, tuple[str, str]] = {}
+
+    def hear(self, opcode: int, content: memoryview) -> None:
+        stream = ReadDataStream(BytesIO(content))
+        if opcode == Opcode.SCHEMA:
+            schema = Schema.read(stream)
+            self._schemas[schema.id] = schema.name[:_NAME]
+        elif opcode == Opcode.CHANNEL:
+            channel = Channel.read(stream)
+            found = self._schemas.get(channel.schema_id, ""), channel.topic[:_NAME]
+            self._channels[channel.id] = found
+        elif opcode == Opcode.METADATA:
+            end = Metadata.read(stream)
+            if end.name == END:
+                self.note = end.metadata.get("note", "")
+                events = end.metadata.get("events", "")
+                if events.isdecimal() and len(events) < 19:
+                    self.events = int(events)
+
+    def entry(self, data: memoryview, at: int, end: int, record_at: int) -> Entry:
+        channel, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(data[at:end])
+        schema, topic = self._channels.get(channel, ("", ""))
+        return Entry(
+            schema=schema,
+            topic=topic,
+            sequence=sequence,
+            log_ns=log_ns,
+            publish_ns=publish_ns,
+            record_at=record_at,
+            start=at + _MESSAGE.size,
+            content=data[at + _MESSAGE.size : end],
+        )
+
+
+class EventNumbers:
     """Which event numbers have come; in the file they start again after 2**32."""
 
     def __init__(self) -> None:
@@ -235,7 +322,7 @@ class _Numbers:
         self._stated = 0
 
     def take(self, number: int) -> None:
-        """Raises `ValueError` for one that is not after the last."""
+        """One has come; raises `ValueError` for one that is not after the last."""
         ahead = (number - self._last) & 0xFFFFFFFF
         if not 0 < ahead < 0x80000000:
             raise ValueError("an event twice")
@@ -252,34 +339,25 @@ class _Numbers:
         return max(self._last, self._stated) - self._count
 
 
-def _inside(opcode: int, content: bytes) -> Iterator[_Record]:
-    """The records of a chunk, or the record itself, as far as they matter here."""
+def _spans(opcode: int, data: memoryview) -> Iterator[tuple[int, int, int]]:
+    """Opcode, first and last place of the records of an unpacked chunk, or of a record itself."""
     if opcode != Opcode.CHUNK:
-        yield from _parsed(opcode, content)
+        yield opcode, 0, len(data)
         return
-    data = _unpacked(Chunk.read(ReadDataStream(BytesIO(content))))
     at = 0
     while at < len(data):
         kind, length = _RECORD.unpack_from(data, at)
         at += _RECORD.size + length
         if at > len(data):
             raise ValueError("a record longer than its chunk")
-        yield from _parsed(kind, data[at - length : at])
+        yield kind, at - length, at
 
 
-def _parsed(opcode: int, content: bytes) -> Iterator[_Record]:
-    stream = ReadDataStream(BytesIO(content))
-    if opcode == Opcode.MESSAGE:
-        yield Message.read(stream, len(content))
-    elif opcode == Opcode.CHANNEL:
-        yield Channel.read(stream)
-    elif opcode == Opcode.SCHEMA:
-        yield Schema.read(stream)
-    elif opcode == Opcode.METADATA:
-        yield Metadata.read(stream)
-
-
-def _unpacked(chunk: Chunk) -> bytes:
+def unpacked_record(opcode: int, content: bytes) -> memoryview:
+    """What a chunk holds, or the record itself."""
+    if opcode != Opcode.CHUNK:
+        return memoryview(content)
+    chunk = Chunk.read(ReadDataStream(BytesIO(content)))
     size = chunk.uncompressed_size
     data = chunk.data
     if chunk.compression == "zstd":
@@ -291,4 +369,4 @@ def _unpacked(chunk: Chunk) -> bytes:
         raise ValueError(f"compressed with '{chunk.compression}'")
     if len(data) != size or chunk.uncompressed_crc not in (0, zlib.crc32(data)):
         raise ValueError("a chunk that fails its checksum")
-    return data
+    return memoryview(data)

@@ -7,6 +7,7 @@ it names.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated, Any
@@ -324,6 +325,9 @@ class EstimatorSettings(_Table):
     floor_radius_m: NotNegative | None = None
 
 
+MOST_CAMERAS = 256
+MOST_SUBJECTS = 64
+"""Of a session: pairs of them are compared."""
 POSES = ("solved", "ahead", "settled")
 """That a live run can send."""
 
@@ -390,6 +394,8 @@ class Session(_Table):
     @model_validator(mode="after")
     def _is_consistent(self) -> Session:
         problems = [
+            *_too_many("camera", len(self.cameras), MOST_CAMERAS),
+            *_too_many("subject", len(self.subjects), MOST_SUBJECTS),
             *_doubled("camera", [camera.name for camera in self.cameras]),
             *_doubled("subject", [subject.name for subject in self.subjects]),
         ]
@@ -402,10 +408,15 @@ class Session(_Table):
         return self
 
 
+def _too_many(what: str, count: int, most: int) -> list[str]:
+    return [f"{count} [[{what}]] tables; at most {most} are read"] if count > most else []
+
+
 def _doubled(what: str, names: list[str]) -> list[str]:
     return [
         f"two [[{what}]] tables are called '{name}'; names must differ"
-        for name in sorted({name for name in names if names.count(name) > 1})
+        for name, count in sorted(Counter(names).items())
+        if count > 1
     ]
 
 

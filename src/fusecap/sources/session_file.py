@@ -90,7 +90,7 @@ def missing_files(session: Session) -> list[str]:
         kind = {True: "folder", False: "file", None: "file or folder"}[folder]
         if not path.exists():
             lines.append(f"{where}: no {kind} {path}; check the path (relative to {FILE_NAME})")
-        elif folder is not None and path.is_dir() != folder:
+        elif (folder is True and not path.is_dir()) or (folder is False and not path.is_file()):
             lines.append(f"{where}: {path} is not a {kind}")
 
     check("[session] calibration", session.settings.calibration, folder=None)

@@ -8,7 +8,9 @@ from collections.abc import Mapping
 import numpy as np
 import viser
 
-from fusecap.recording.reader import RecordedEvent, Recording
+from fusecap.recording.index import Places, RecordingIndex
+from fusecap.recording.layout import KEYPOINTS
+from fusecap.recording.reader import RecordedEvent
 from fusecap.setup import SessionSetup
 from fusecap.types import CameraSample
 from fusecap.viewer.figure import Pose
@@ -16,40 +18,37 @@ from fusecap.viewer.floor_plan import FloorDrawing, FloorPlan, standing_places
 from fusecap.viewer.palette import Rgb
 from fusecap.viewer.pictures import Pictures, mosaic
 
-_KEPT_HZ = 10.0
-"""Per camera: what a page shows; an hour of four cameras takes about 130 MB."""
+SHOWN_HZ = 10.0
+"""Of each camera's detections."""
 _OLD_NS = 500_000_000
 """After which a detection is no longer of the present."""
 
 
 class RecordedDetections:
-    """The detections of a recording, thinned out."""
+    """The detections of a recording, read as they are looked at."""
 
-    def __init__(self, recording: Recording, setup: SessionSetup) -> None:
+    def __init__(self, index: RecordingIndex, setup: SessionSetup) -> None:
         self.setup = setup
-        self._times_ns: list[list[int]] = [[] for _ in setup.rig.cameras]
-        self._people: list[list[np.ndarray]] = [[] for _ in setup.rig.cameras]
-        for item in recording.items():
-            if isinstance(item, RecordedEvent) and isinstance(item.event, CameraSample):
-                self._keep(item.event)
+        self._index = index
+        none = Places(KEYPOINTS)
+        self._places = [
+            index.keypoints.get(f"/camera/{name}/keypoints", none) for name in setup.rig.names
+        ]
 
     def at(self, camera: int, timestamp_ns: int) -> np.ndarray | None:
         """(n, k, 3) the latest of a camera; None where there is none of the present."""
-        times_ns = self._times_ns[camera]
-        row = bisect_right(times_ns, timestamp_ns) - 1
-        if row < 0 or timestamp_ns - times_ns[row] > _OLD_NS:
+        places = self._places[camera]
+        row = bisect_right(places.times_ns, timestamp_ns) - 1
+        if row < 0 or timestamp_ns - places.times_ns[row] > _OLD_NS:
             return None
-        return self._people[camera][row].astype(np.float64)
+        found = self._index.read(places, row)
+        if not (isinstance(found, RecordedEvent) and isinstance(found.event, CameraSample)):
+            return None
+        return found.event.people
 
     def views(self, gui: viser.GuiApi, colours: Mapping[str, Rgb]) -> RecordedViews:
         """Adds them to a page."""
         return RecordedViews(gui, self, colours)
-
-    def _keep(self, sample: CameraSample) -> None:
-        times_ns = self._times_ns[sample.camera]
-        if not times_ns or sample.timestamp_ns - times_ns[-1] >= 1e9 / _KEPT_HZ:
-            times_ns.append(sample.timestamp_ns)
-            self._people[sample.camera].append(sample.people.astype(np.float32))
 
 
 class RecordedViews:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from fusecap.errors import CalibrationError
-from fusecap.geometry.camera import Y_UP_FROM_Z_UP, Rig
+from fusecap.geometry.camera import MOST_CAMERAS, Y_UP_FROM_Z_UP, Rig
 from fusecap.sources.calibration_files.formats import rig_formats
 from fusecap.sources.calibration_files.plausibility import MILLIMETRES_ABOVE, camera_spread
 from fusecap.sources.calibration_files.rig_format import StatedCamera
@@ -37,6 +37,10 @@ def load_rig(
     stated, unit_is_open = _read(path)
     if not stated:
         raise CalibrationError(f"{path}: holds no camera; {_known()}")
+    if len(stated) > MOST_CAMERAS:
+        raise CalibrationError(
+            f"{path}: {len(stated)} cameras; at most {MOST_CAMERAS} are read: keep those in use"
+        )
     cameras = [camera() for name, camera in stated if names is None or name in names]
     if names is not None and {camera.name for camera in cameras} != set(names):
         missing = [name for name in names if name not in {camera.name for camera in cameras}]
