@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from fusecap.batch.detect import detector_options
+from fusecap.detect.build import build_detector
 from fusecap.detect.detector import DetectorOptions
 from fusecap.detect.model_store import model_path, to_download
 from fusecap.detect.runtimes.choice import runtime_for
@@ -33,9 +34,12 @@ def check_detection(session: Session, findings: Findings) -> None:
 
 
 def _check_networks(options: DetectorOptions, findings: Findings) -> None:
+    """Whether they are there, and then whether they make a detector."""
+    there = True
     for model in dict.fromkeys((options.model, options.person_model)):
         try:
             stored = to_download(model)
+            there &= stored is None
             if stored is not None and stored.url is None:
                 model_path(model)  # says where it comes from
             elif stored is not None:
@@ -47,5 +51,11 @@ def _check_networks(options: DetectorOptions, findings: Findings) -> None:
                 )
             path = model_path(model) if stored is None else f"{model}{stored.suffix}"
             runtime_for(path, options.runtime)
+        except FusecapError as error:
+            there = False
+            findings.add("error", "detector", str(error))
+    if there:
+        try:
+            build_detector(options, threads=1)
         except FusecapError as error:
             findings.add("error", "detector", str(error))

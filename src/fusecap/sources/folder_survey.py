@@ -112,10 +112,11 @@ def _files(folder: Path, depth: int) -> Iterator[Path]:
     for entry in ordered:
         if entry.name.startswith("."):
             continue
-        if entry.is_file():
-            yield Path(entry.path)
-        elif depth and entry.is_dir():
-            yield from _files(Path(entry.path), depth - 1)
+        path = Path(entry.path)  # whose questions, unlike an entry's, a link to itself answers
+        if path.is_file():
+            yield path
+        elif depth and path.is_dir():
+            yield from _files(path, depth - 1)
 
 
 def _calibration(

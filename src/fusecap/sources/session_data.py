@@ -329,11 +329,12 @@ def solve_times_s(
             reached_s, until = end_s, name
     first_s = min(start for start, _, _ in spans)
     rate_hz = session.settings.rate_hz
-    before = np.floor((spans[0][0] - first_s) * rate_hz + 1e-6)
-    count = int(np.floor((reached_s - spans[0][0]) * rate_hz + 1e-6) + before) + 1
-    if count > MAX_INSTANTS:
+    with np.errstate(over="ignore"):
+        before = np.floor((spans[0][0] - first_s) * rate_hz + 1e-6)
+        count = np.floor((reached_s - spans[0][0]) * rate_hz + 1e-6) + before + 1
+    if not count <= MAX_INSTANTS:
         raise SessionError(
-            f"{session.path}: {first_s:g} to {reached_s:g} s at {rate_hz:g} Hz are {count} "
+            f"{session.path}: {first_s:g} to {reached_s:g} s at {rate_hz:g} Hz are {count:.3g} "
             "instants; check times, rates and offset_s"
         )
     return spans[0][0] + np.arange(-before, count - before) / rate_hz
