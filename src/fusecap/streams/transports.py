@@ -28,8 +28,10 @@ if TYPE_CHECKING:
 
 CLIENT_QUEUE = 4
 """Messages a WebSocket client may lie behind."""
+_MOST_HEARD = 1000
+"""Messages of a client, which nobody asked for: then it is let go."""
 _MOST_HEARD_BYTES = 1024
-"""Of a message from a client; none is read."""
+"""Of a message from a client; none is used."""
 _GOODBYE_S = 0.5
 """How long the server lets clients take what is queued when it closes."""
 _LOG = logging.getLogger("fusecap.websocket")
@@ -218,7 +220,7 @@ class WebSocketServer:
         client.something.set()
         self._clients.add(client)
         self.clients_ever += 1
-        gone = asyncio.ensure_future(connection.wait_closed())
+        gone = asyncio.ensure_future(self._hear(connection))
         try:
             while not gone.done():
                 woken = asyncio.ensure_future(client.something.wait())
@@ -230,6 +232,15 @@ class WebSocketServer:
         finally:
             gone.cancel()
             self._clients.discard(client)
+
+    async def _hear(self, connection: ServerConnection) -> None:
+        """Until a client is gone: what is left unread would hide its farewell."""
+        from websockets.exceptions import ConnectionClosed
+
+        with contextlib.suppress(ConnectionClosed):
+            for _ in range(_MOST_HEARD):
+                await connection.recv()
+            await connection.close(1008, "this stream only sends")
 
     async def _send_queued(self, client: _Client) -> None:
         if client.cast is not None:

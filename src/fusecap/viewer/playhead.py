@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from jaxtyping import Float
 
@@ -15,8 +17,18 @@ class Playhead:
         self._time_s = time_s
         self.position_s = 0.0
         self.playing = True
-        self.speed = 1.0
         self.loop = True
+        self._speed = 1.0
+
+    @property
+    def speed(self) -> float:
+        """Times as fast as it was."""
+        return self._speed
+
+    @speed.setter
+    def speed(self, speed: float) -> None:
+        if math.isfinite(speed):
+            self._speed = min(max(speed, MIN_SPEED), MAX_SPEED)
 
     @property
     def end_s(self) -> float:
@@ -47,8 +59,9 @@ class Playhead:
             self.position_s = 0.0
 
     def seek(self, time_s: float) -> None:
-        """Go there and pause."""
-        self.position_s = min(max(time_s, 0.0), self.end_s)
+        """Go there and pause; where that is no time, only pause."""
+        if math.isfinite(time_s):
+            self.position_s = min(max(time_s, 0.0), self.end_s)
         self.playing = False
 
     def step(self, frames: int) -> None:
