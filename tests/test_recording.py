@@ -29,6 +29,7 @@ from fusecap.body.landmarks import LANDMARK_SETS, LandmarkOffsets
 from fusecap.errors import InputError
 from fusecap.live.devices.source import SessionClock
 from fusecap.live.recorder import Recorder
+from fusecap.recording import reader
 from fusecap.recording.reader import RecordedEvent, RecordedPose, Recording
 from fusecap.recording.setup_json import setup_from_values, setup_values
 from fusecap.recording.writer import RecordingWriter
@@ -329,6 +330,17 @@ def test_a_record_longer_than_the_file_ends_the_reading(whole, tmp_path, length)
     path.write_bytes(header_of(whole) + struct.pack("<BQ", Opcode.CHUNK, length) + b"xyz")
     recording = Recording(path)
     assert list(recording.items()) == [] and recording.loss.unread_bytes == 12
+
+
+def test_many_chunks_that_unpack_to_far_more_than_the_file_are_refused(
+    whole, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(reader, "MAX_BYTES", 1 << 20)
+    bomb = chunk_record(zstandard.compress(bytes(1 << 18)), 1 << 18)
+    path = tmp_path / "bombs.mcap"
+    path.write_bytes(header_of(whole) + bomb * 60)
+    with pytest.raises(InputError, match="unpacks to more than"):
+        list(Recording(path).items())
 
 
 def test_a_chunk_that_would_unpack_to_terabytes_is_left_out(whole, tmp_path):

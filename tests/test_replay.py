@@ -10,7 +10,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from fusecap.batch.replay import Replay, recorded_take, replay, solve_as_live
+from fusecap.batch.replay import (
+    RecordedMotion,
+    Replay,
+    recorded_setup,
+    recorded_take,
+    replay,
+    solve_as_live,
+)
 from fusecap.batch.second_solve import solve_recording
 from fusecap.batch.solve import solve_session
 from fusecap.body.landmarks import LANDMARK_SETS
@@ -19,13 +26,15 @@ from fusecap.doctor import diagnose_recording
 from fusecap.engine.engine import Engine
 from fusecap.errors import InputError
 from fusecap.geometry.camera import Rig
-from fusecap.recording.reader import Recording
+from fusecap.recording.index import RecordingIndex
+from fusecap.recording.reader import RecordedEvent, Recording
 from fusecap.setup import SessionSetup
 from fusecap.sources.session import Session
 from fusecap.sources.session_data import open_session
 from fusecap.sources.session_file import load_session
 from fusecap.stored_take import load_take
 from fusecap.types import GRAVITY_M_S2, CameraSample, Command, CommandKind, ImuSample, Tick
+from fusecap.viewer.recording import RecordedDetections
 from live_events import same_bits
 from recorded_run import record, simulated_run
 
@@ -94,6 +103,24 @@ def test_the_take_of_a_recording_holds_the_recorded_poses(run, recorded):
     assert take.subject_names[:2] == live.take.subject_names[:2]
     assert np.array_equal(take.timestamps_ns, live.take.timestamps_ns[first:])
     assert np.array_equal(take.theta, live.take.theta[:, first:], equal_nan=True)
+
+
+def test_single_instants_of_a_recording_are_those_of_the_whole(recorded):
+    recording = Recording(recorded)
+    index = RecordingIndex(recording, keypoints_hz=10.0)
+    motion, take = RecordedMotion(recording, index), recorded_take(recording)
+    frames = [3, 10, 11, 40]
+    some, same = motion.at_frames(frames), take.at_frames(frames)
+    for name in ("timestamps_ns", "tracked", "theta", "bone_sigma_deg"):
+        np.testing.assert_array_equal(getattr(some, name), getattr(same, name))
+    np.testing.assert_array_equal(motion.time_s, take.time_s)
+    samples = [item.event for item in recording.items() if isinstance(item, RecordedEvent)]
+    seen = [s for s in samples if isinstance(s, CameraSample) and s.camera == 1]
+    detections = RecordedDetections(index, recorded_setup(recording))
+    found = detections.at(1, seen[0].timestamp_ns)
+    np.testing.assert_array_equal(found, seen[0].people)
+    assert detections.at(1, seen[0].timestamp_ns - 1) is None
+    assert detections.at(1, seen[-1].timestamp_ns + 10**9) is None
 
 
 def test_second_solve_is_as_good_as_that_of_the_session(run, recorded, folder):

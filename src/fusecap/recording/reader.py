@@ -39,6 +39,7 @@ MAX_RATIO = 100
 """Of what all chunks unpack to, `MAX_BYTES` aside, to the file; a run's is about 3."""
 _MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")
+_BETWEEN = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA)
 _NAME = 1000
 """Of a schema or a channel: so much is kept."""
 _MESSAGE = struct.Struct("<HIQQ")
@@ -181,7 +182,7 @@ class Recording:
                     for kind, at, end in _spans(opcode, data):
                         if kind == Opcode.MESSAGE:
                             yield said.entry(data, at, end, record_at)
-                        else:
+                        elif kind in _BETWEEN:
                             said.hear(kind, data[at:end])
                 except (*_BROKEN, zstandard.ZstdError, MemoryError):
                     loss.broken_chunks += 1
