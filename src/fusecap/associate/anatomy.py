@@ -82,6 +82,15 @@ class Anatomy:
         human = ((lengths >= low) & (lengths <= high)).sum(axis=-1)
         return (measured >= MIN_LIMBS) & (human >= 0.75 * measured)
 
+    def moved_m(
+        self, before: Float[np.ndarray, "t k 3"], after: Float[np.ndarray, "t k 3"]
+    ) -> Float[np.ndarray, " t"]:
+        """How far the middles of common torso landmarks are apart; 0 without any."""
+        step = after[:, self._torso] - before[:, self._torso]
+        known = np.isfinite(step[:, :, :1])
+        mean = np.where(known, step, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
+        return np.sqrt(np.einsum("ti,ti->t", mean, mean))
+
     def centre(self, landmarks: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "3"]:
         """Middle of the torso [m], of all landmarks where it was not seen; NaN without any."""
         torso = landmarks[self._torso]

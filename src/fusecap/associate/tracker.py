@@ -123,8 +123,8 @@ class Tracker:
         follow(self._rig, views, tracks, person, expected, now_ns)
         if self._single:
             person, measured = self._find_single(views, person, measured, expected, now_ns)
-        for track, views_of in zip(tracks, (person >= 0).sum(axis=1), strict=True):
-            track.views = int(views_of) or track.views
+        for track, count in zip(tracks, (person >= 0).sum(axis=1).tolist(), strict=True):
+            track.views = count or track.views
         elapsed_ns = 0 if self._last_ns is None else now_ns - self._last_ns
         self._population.forget(measured, self._cast.ids(), self._looking, elapsed_ns, now_ns)
         self._cast.forget(self._population.tracks, now_ns)
@@ -224,8 +224,9 @@ class Tracker:
         moving = [self._population.tracks[t] for t in np.flatnonzero(agreed)]
         if not moving:
             return
-        for track, found, hoped in zip(moving, measured[agreed], expected[agreed], strict=True):
-            self._note_jump(track, hoped, found, now_ns)
+        moved_m = self._anatomy.moved_m(expected[agreed], measured[agreed])
+        for row in np.flatnonzero(moved_m > self._options.gate_m):
+            self._note_jump(moving[row], expected[agreed][row], measured[agreed][row], now_ns)
         absorb(moving, measured[agreed], expected[agreed], now_ns)
         measure(moving, self._anatomy.limb_lengths(measured[agreed]))
         for track, views in zip(moving, count[agreed], strict=True):
