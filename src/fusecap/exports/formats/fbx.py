@@ -51,7 +51,7 @@ def write_fbx(take: Take, path: Path, options: ExportOptions) -> None:
         file = FbxFile.read(base.read_bytes())
     scene = _Scene(file)
     ticks = np.round(motions[0].time_s * _TICKS_PER_S).astype(np.int64)
-    times = _Times(every=array_property(ticks), ends=array_property(ticks[[0, -1]]))
+    times = _Times(every=array_property(ticks), ends=array_property(np.unique(ticks[[0, -1]])))
     for motion, label in zip(motions, labels, strict=True):
         joints = scene.joints_of(label)
         for joint, (places, degrees) in _curves(motion, joints).items():
@@ -101,7 +101,7 @@ class _Scene:
     ) -> None:
         """The curves of one of a model's properties get these values."""
         still = np.ptp(values, axis=0).max() < _STILL
-        kept = values[[0, -1]] if still else values
+        kept = values[np.unique([0, len(values) - 1])] if still else values
         for node, to in self._below[model.whole(0)]:
             if to != what:
                 continue
