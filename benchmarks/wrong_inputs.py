@@ -126,13 +126,16 @@ def spoil_line(random: np.random.Generator, folder: Path) -> str:
 
 
 def spoil_table(random: np.random.Generator, folder: Path) -> str:
-    """One table of session.toml gone, or all of one kind late, misnamed or turned."""
+    """One camera of session.toml gone, or sensors late or turned."""
     path = folder / "session.toml"
     text = path.read_text()
     tables = re.split(r"\n(?=\[\[)", text)
-    match random.integers(3):
+    match random.integers(3 if "[[subject.imu]]" in text else 1):
         case 0:
-            index = int(random.integers(1, len(tables)))
+            rows = [i for i, t in enumerate(tables) if t.startswith("[[camera]]")]
+            if not rows:
+                return ""
+            index = int(random.choice(rows))
             told = f"without {tables[index].splitlines()[:2]}"
             del tables[index]
         case 1:

@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
+from fusecap.batch.solve import solve_session
 from fusecap.body.landmarks import landmark_set_named
 from fusecap.body.pose import forward_kinematics, landmarks_in_world
 from fusecap.body.shape import BodyShape
@@ -135,6 +136,13 @@ def test_who_lies_below_cameras_at_the_ceiling_lies_and_the_world_stands(facing_
     findings = Findings()
     _check_upright(session, Rig(cameras=tuple(cameras)), people, BODY25, findings)
     assert any("away from up" in str(finding) for finding in findings) is told
+
+
+def test_a_subject_who_was_never_found_is_told(tmp_path):
+    path = write_session(tmp_path)
+    edit(path, "[[camera]]", '[[subject]]\nname = "far"\nstart_m = [40.0, 40.0]\n\n[[camera]]')
+    notes = solve_session(open_session(load_session(path))).report.notes
+    assert any(note.startswith("far: never found") for note in notes)
 
 
 def test_an_unstated_rate_is_said_to_be_assumed(tmp_path):

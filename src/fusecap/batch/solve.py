@@ -212,9 +212,22 @@ def solve_instants(
             statuses=dict(statuses),
             elapsed_s=time.perf_counter() - started,
             interrupted=interrupted,
-            notes=(*notes, *tracked.notes, *_small_people(subjects.heights_m)),
+            notes=(
+                *notes,
+                *tracked.notes,
+                *([] if interrupted else _never_found(subjects.never_found)),
+                *_small_people(subjects.heights_m),
+            ),
         ),
     )
+
+
+def _never_found(names: Sequence[str]) -> list[str]:
+    return [
+        f"{name}: never found; nobody was where start_m says, or moved as the sensors say: see "
+        "whether they are of this calibration's world"
+        for name in names
+    ]
 
 
 def _small_people(heights_m: Mapping[str, float]) -> list[str]:
@@ -245,6 +258,11 @@ class SubjectSums:
             sums.tracked += 1
             sums.turn_deg.add(estimate.bone_sigma_deg)
             sums.place_m.add(estimate.position_sigma_m)
+
+    @property
+    def never_found(self) -> list[str]:
+        """Who has no pose."""
+        return [name for name, sums in self._people.items() if not sums.tracked]
 
     @property
     def heights_m(self) -> dict[str, float]:
