@@ -25,7 +25,7 @@ def crowd(rng, count, frame):
 def test_people_come_back_as_they_were_in_any_order(rng, monkeypatch, in_memory):
     monkeypatch.setattr(Spool, "IN_MEMORY", in_memory)
     frames = [crowd(rng, count, frame) for frame, count in enumerate([2, 0, 1, 3, 0, 2])]
-    store = PeopleStore(25)
+    store = PeopleStore(25, 3)
     for people in frames:
         store.append(people)
         assert_array_equal(store[0], frames[0])  # reading between writes

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int, UInt8
 
+from fusecap.appearance import APPEARANCE_SIZE
 from fusecap.errors import InputError
 from fusecap.types import Detections, ImuReading
 
@@ -61,11 +62,16 @@ def believable_keypoints(values: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray,
 def surest(people: Float[np.ndarray, "n k 3"]) -> Float[np.ndarray, "m k 3"]:
     """People with any believable keypoint; of a crowd the 64 with the most confidence."""
     people = believable_keypoints(people)
-    people = people[(people[:, :, 2] > 0).any(axis=1)]
-    if len(people) > MOST_PEOPLE:
-        ordered = np.argsort(-people[:, :, 2].sum(axis=1), kind="stable")
-        people = people[np.sort(ordered[:MOST_PEOPLE])]
-    return people
+    return people[surest_rows(people)]
+
+
+def surest_rows(people: Float[np.ndarray, "n k 3"]) -> Int[np.ndarray, " m"]:
+    """Rows of people with any keypoint, all of them believable; of a crowd the 64 surest."""
+    confidence = people[:, :, 2].sum(axis=1)
+    rows = np.flatnonzero(confidence > 0)
+    if len(rows) > MOST_PEOPLE:
+        rows = np.sort(rows[np.argsort(-confidence[rows], kind="stable")[:MOST_PEOPLE]])
+    return rows
 
 
 def surest_of_views(
@@ -112,7 +118,20 @@ def believable_detections(given: Detections, cameras: int, landmarks: int) -> Be
         timestamp_ns=checked_moment(given.timestamp_ns, None),
         people=_believable_views(people),
         looked=given.looked,
+        appearance=_checked_appearance(given.appearance, people),
     )
+
+
+def _checked_appearance(
+    given: tuple[np.ndarray, ...] | None, people: list[Float[np.ndarray, "_ k 3"]]
+) -> tuple[UInt8[np.ndarray, "_ 40"], ...] | None:
+    if given is None:
+        return None
+    shapes = [(len(some), APPEARANCE_SIZE) for some in people]
+    if [np.shape(some) for some in given] != shapes or any(a.dtype != np.uint8 for a in given):
+        found = ", ".join(f"{np.shape(some)} of {some.dtype}" for some in given)
+        raise InputError(f"appearance: {found}; expected uint8, per view {shapes}")
+    return given
 
 
 def _believable_views(

@@ -45,6 +45,9 @@ class Detections:
     """Per camera the n people's keypoints: x [px], y [px], confidence 0-1 (0 = missing)."""
     looked: tuple[bool, ...] | None = None
     """Per camera whether it sees at all, that is, whether nobody means nobody; None: all do."""
+    appearance: tuple[UInt8[np.ndarray, "n 40"], ...] | None = None
+    """Row by row how the people's clothes look to the camera (`fusecap.appearance`), 0 where not
+    seen; None without pictures."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -143,6 +146,8 @@ class CameraSample:
     """Of the exposure, on the session's clock."""
     people: Float[np.ndarray, "n k 3"]
     """x [px], y [px], confidence 0-1; NaN, NaN, 0 where missing."""
+    appearance: UInt8[np.ndarray, "n 40"] | None = None
+    """As in `Detections`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fusecap.associate.anatomy import Anatomy, size_misfit
+from fusecap.associate.looks import SAME, WAIT_S, by_looks, differences, exchange, exchanged
 from fusecap.associate.matching import cheapest
 from fusecap.associate.options import TrackerOptions
 from fusecap.associate.sensor_vote import FITS, MARGIN, SOON_S, SURE_S, SensorVote
@@ -69,6 +70,8 @@ class Cast:
         self._begun_ns: int | None = None
         self.kept_out: list[Track] = []
         """Who is established and has no place while a subject is missing."""
+        self.undecided: list[Track] = []
+        """Who may be a missing subject, and has not been seen alone yet."""
         self._single = len(rig) == 1
         self.size = options.max_subjects or len(subjects) or sys.maxsize
         """Subjects there may be at most."""
@@ -161,8 +164,28 @@ class Cast:
         gain = sum(cost[row, now[row]] - cost[row, column] for row, column in moves.items())
         if not moves or gain < MARGIN * len(moves):
             return {}
+        return self._give({places[row].name: tracks[column] for row, column in moves.items()})
+
+    def part_by_looks(
+        self, tracks: Sequence[Track], now_ns: int, vote: SensorVote
+    ) -> tuple[dict[int, int], int]:
+        """Put right who came out of an overlap exchanged, as clothes show; wearers are not asked.
+
+        Returns what `pair_anew` does, and since when it has been so [ns].
+        """
+        worn = [p.track for p in self._places if p.live and p.name in vote.heard]
+        moves = exchanged([t for t in tracks if t.seen_ns == now_ns and t not in worn], now_ns)
+        if not moves:
+            return {}, now_ns
+        since_ns = min(t.looks.alone_ns for t in moves if t.looks)
+        body_of = {person: body for body, person in moves.items()}
+        exchange(moves)
+        places = [p for p in self._places if p.live and p.track in body_of]
+        return self._give({p.name: body_of[p.track] for p in places if p.track}), since_ns
+
+    def _give(self, given: dict[str, Track]) -> dict[int, int]:
+        """Give live places other tracks; by the id that a track had, the one it has then."""
         followed = {p.name: p.track for p in self._places if p.live and p.track}
-        given = {places[row].name: tracks[column] for row, column in moves.items()}
         freed = [followed[name] for name in given if followed[name] not in given.values()]
         robbed = [n for n, t in followed.items() if n not in given and t in given.values()]
         given.update({name: freed.pop() for name in robbed})
@@ -236,12 +259,23 @@ class Cast:
             if place.name in vote.heard and (now_ns - self._begun_ns) * 1e-9 > o.patience_s:
                 place.start_m = None
         newcomers = [t for t in tracks if t.track_id not in subjects and self._may_enter(t, now_ns)]
-        self.kept_out = []
+        self.kept_out, self.undecided = [], []
+        known = [p for p in self._places if p.track or p.start_m]
+        away = self._by_clothes(newcomers, known, now_ns, vote)
+        self.undecided = [
+            t for n, t in enumerate(newcomers) if self._hidden(t, away[n], known, now_ns)
+        ]
+        away = away[[t not in self.undecided for t in newcomers]]
+        newcomers = [t for t in newcomers if t not in self.undecided]
         if not newcomers:
             return
-        known = [p for p in self._places if p.track or p.start_m]
-        cost = np.array([[self._claim(t, p) for p in known] for t in newcomers])
-        cost = cost.reshape(len(newcomers), len(known))
+        cost = np.array(
+            [
+                [self._claim(t, p, alike=bool(away[n, k] < SAME)) for k, p in enumerate(known)]
+                for n, t in enumerate(newcomers)
+            ]
+        )
+        cost = np.where(by_looks(away), cost.reshape(len(newcomers), len(known)), np.inf)
         open_s = [o.doubt_s if p.live else 0.0 for p in known]
         silent_s = [(now_ns - p.track.triangulated_ns) * 1e-9 if p.track else 0.0 for p in known]
         undecided = np.array(silent_s) < np.array(open_s)
@@ -297,8 +331,47 @@ class Cast:
         ]
         return left, waiting
 
-    def _claim(self, track: Track, place: Place) -> float:
-        """How badly a newcomer fits a waiting or missing subject [m]; infinite: not at all."""
+    def _by_clothes(
+        self, newcomers: Sequence[Track], places: Sequence[Place], now_ns: int, vote: SensorVote
+    ) -> np.ndarray:
+        """How differently newcomers and who had a place look (n, p); NaN where nothing tells.
+
+        Sensors tell better, and after a while people may have changed.
+        """
+        away = np.full((len(newcomers), len(places)), np.nan)
+        told = [
+            k
+            for k, p in enumerate(places)
+            if p.track is not None
+            and p.track.looks is not None
+            and p.name not in vote.heard
+            and (now_ns - p.track.seen_ns) * 1e-9 <= self._options.memory_s
+        ]
+        shown = [n for n, t in enumerate(newcomers) if t.looks is not None]
+        looks = [p.track.looks for k, p in enumerate(places) if k in told and p.track]
+        away[np.ix_(shown, told)] = differences(
+            [t.looks for t in newcomers if t.looks], [some for some in looks if some]
+        )
+        return away
+
+    def _hidden(self, track: Track, away: np.ndarray, places: Sequence[Place], now_ns: int) -> bool:
+        """Whether clothes may soon tell if a newcomer is somebody who is missing."""
+        if track.looks is None or (now_ns - track.born_ns) * 1e-9 >= WAIT_S:
+            return False
+        told = [
+            not p.live
+            and p.track is not None
+            and p.track.looks is not None
+            and p.track.looks.is_known
+            for p in places
+        ]
+        return bool((np.isnan(away) & np.array(told, dtype=bool)).any())
+
+    def _claim(self, track: Track, place: Place, *, alike: bool) -> float:
+        """How badly a newcomer fits a waiting or missing subject [m]; infinite: not at all.
+
+        Of who is dressed `alike` size says less.
+        """
         o = self._options
         centre = self._anatomy.centre(track.landmarks)
         if place.track is None:
@@ -318,7 +391,8 @@ class Cast:
         reach = o.reach_m + 2 * o.reach_speed_m_s * since_s
         optional = place.live or self._room() > 0 or any(p.track is None for p in self._places)
         sized = not place.live or min(track.frames, lost.frames) >= o.size_frames
-        if optional and ((sized and misfit > o.size_tolerance) or away > reach):
+        tolerance = 2 * o.size_tolerance if alike else o.size_tolerance
+        if optional and ((sized and misfit > tolerance) or away > reach):
             return np.inf
         return float(away / reach + misfit / o.size_tolerance)
 
@@ -329,6 +403,8 @@ class Cast:
             if place.live:
                 place.track.replaced = True
             track.becomes(place.track, everyone)
+            if track.looks is not None and place.track.looks is not None:
+                track.looks.continues(place.track.looks)
         place.track = track
         place.live = True
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fusecap.associate.clothes import Looks
 from fusecap.associate.options import TrackerOptions
 from fusecap.kernels import association as kernels
 
@@ -53,6 +54,7 @@ class Track:
         "landmarks",
         "limb_count",
         "limb_sum_m",
+        "looks",
         "missed_ns",
         "overlap_since_ns",
         "replaced",
@@ -95,6 +97,8 @@ class Track:
         """For how long two cameras or more have looked and no two seen it."""
         self.beside: dict[Track, float] = {}
         """Instants in which it and another were measured apart; of few views each counts less."""
+        self.looks: Looks | None = None
+        """How the clothes look, where pictures tell."""
         self.told = False
         """Whether a user knows that this person is left out."""
         self.replaced = False

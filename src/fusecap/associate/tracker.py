@@ -29,6 +29,7 @@ from jaxtyping import Float
 
 from fusecap.associate.anatomy import Anatomy
 from fusecap.associate.candidates import find_candidates
+from fusecap.associate.looks import DECIDE_NS, learn
 from fusecap.associate.matching import Matcher
 from fusecap.associate.one_view import find_again, follow, nearest_in_view
 from fusecap.associate.options import TrackerOptions
@@ -133,6 +134,8 @@ class Tracker:
         self._vote.hear(
             [tracks[row] for row in rows], measured[rows], self._readings, elapsed_ns * 1e-9
         )
+        if detections.appearance is not None:
+            self._look([tracks[row] for row in rows], views.local(person)[rows], detections)
         self.renumbered, self.renumbered_since_ns = self._cast.return_to_way(
             everyone, self._vote, now_ns
         )
@@ -141,6 +144,11 @@ class Tracker:
         if not self.renumbered:
             self.renumbered = self._cast.pair_anew(everyone, self._vote)
             self.notes = self._renumbered_notes("sensors say so")
+        if not self.renumbered and detections.appearance is not None and self._turns(now_ns):
+            self.renumbered, self.renumbered_since_ns = self._cast.part_by_looks(
+                everyone, now_ns, self._vote
+            )
+            self.notes = self._renumbered_notes("clothes say so")
         self.notes += [
             f"{name}: sensors and cameras contradict each other; either nobody who is seen wears "
             "these sensors, or their bones or headings are not as stated (fusecap calibrate imu)"
@@ -245,6 +253,16 @@ class Tracker:
         hoped_m = centre(np.where(both, expected, np.nan))
         track.note_jump(hoped_m, centre(np.where(both, found, np.nan)), now_ns, o.gate_m, o.doubt_s)
 
+    def _look(self, tracks: list[Track], person: np.ndarray, detections: Detections) -> None:
+        """What pictures show of clothes; `person` (t, c) counts within each camera."""
+        if tracks and detections.appearance is not None:
+            centre_m = np.array([self._anatomy.centre(track.landmarks) for track in tracks])
+            learn(tracks, person, detections.appearance, centre_m, detections.timestamp_ns)
+
+    def _turns(self, now_ns: int) -> bool:
+        """Whether a new stretch of time begins in which clothes are compared."""
+        return now_ns // DECIDE_NS != (self._last_ns or 0) // DECIDE_NS
+
     def _count_frame(self, track: Track, views: int, now_ns: int) -> None:
         track.triangulated_ns = now_ns
         track.frames += 1
@@ -339,9 +357,10 @@ class Tracker:
         return person, measured
 
     def _waits(self, track: Track, now_ns: int) -> bool:
-        """Whether sensors may still tell who a newcomer is."""
+        """Whether sensors or clothes may still tell who a newcomer is."""
         age_s = (now_ns - track.born_ns) * 1e-9
-        return bool(self._vote.heard) and age_s < self._options.patience_s
+        soon = bool(self._vote.heard) and age_s < self._options.patience_s
+        return soon or track in self._cast.undecided
 
     def _renumbered_notes(self, why: str) -> list[str]:
         return [

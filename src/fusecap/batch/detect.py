@@ -31,6 +31,7 @@ from jaxtyping import Bool, Float, Int
 
 from fusecap.believable import surest_of_views
 from fusecap.body.landmarks import LandmarkSet
+from fusecap.detect.clothes import ClothesReader
 from fusecap.detect.detector import Detector, DetectorOptions
 from fusecap.errors import InputError, SessionError
 from fusecap.exports import openpose
@@ -252,7 +253,7 @@ def _detect(
             elif wanted[index] < 0:
                 people[index] = read_people(work.frame_path(number), detector.landmarks)
             else:
-                people[index] = work.keep(number, people[index], images[index] is not None)
+                people[index] = work.keep(number, people[index], images[index])
         expected.learn(frames.timestamp_ns, people)
         if progress is not None:
             progress("detecting frames", sum(work.looked_at for work in works), total)
@@ -329,6 +330,7 @@ class _Work:
         self.looked_at = 0
         """Frames, those written included."""
         self._landmarks = detector.landmarks
+        self._clothes = ClothesReader(detector.landmarks)
         self._undecodable = 0
         self._record = DetectionRecord(
             landmark_set=detector.landmarks.name,
@@ -365,15 +367,16 @@ class _Work:
     def frame_path(self, number: int) -> Path:
         return openpose.frame_path(self.camera.folder, self.camera.name, number)
 
-    def keep(self, number: int, people: np.ndarray | None, decoded: bool) -> np.ndarray:
+    def keep(self, number: int, people: np.ndarray | None, image: np.ndarray | None) -> np.ndarray:
         """Writes a frame that has no file, that of a picture which cannot be decoded as empty."""
-        if people is None or not decoded:
+        if people is None or image is None:
             people = np.empty((0, len(self._landmarks.landmark_names), 3))
         self.looked_at += 1
         if not self.done[number]:
-            self._undecodable += not decoded
+            self._undecodable += image is None
+            looks = None if image is None else self._clothes.read(image, people)
             everything = self._landmarks.with_all(people)
-            openpose.write_frame(self.camera.folder, self.camera.name, number, everything)
+            openpose.write_frame(self.camera.folder, self.camera.name, number, everything, looks)
             self.done[number] = True
             self.written += 1
         return people

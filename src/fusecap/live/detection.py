@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from fusecap.detect.clothes import ClothesReader
 from fusecap.detect.detector import Detector
 from fusecap.live.devices.source import SessionClock
 from fusecap.live.health import Incidents, Meter
@@ -47,6 +48,7 @@ class DetectionLoop:
         self.overtaken = [0] * cameras
         """Per camera the images that made room for newer ones."""
         self._detector = detector
+        self._clothes = ClothesReader(detector.landmarks)
         self._emit = emit
         self._show = show
         self._clock = clock
@@ -143,6 +145,7 @@ class DetectionLoop:
             self._show(image)
         expected, self._curious = self._expected, True
         found = self._detector.detect(images, expected)
+        looks = {i.camera: self._clothes.read(i.image, found[i.camera]) for i, _ in taken}
         end_ns = self._clock.now_ns()
         self._latency.add(DETECTION, end_ns - start_ns)
         self.rounds.add(end_ns)
@@ -153,6 +156,7 @@ class DetectionLoop:
                     camera=image.camera,
                     timestamp_ns=image.timestamp_ns,
                     people=found[image.camera],
+                    appearance=looks[image.camera],
                 )
             )
 

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from fusecap.appearance import APPEARANCE_SIZE
 from fusecap.body.shape import BodyShape
 from fusecap.body.skeleton import skeleton_named
 from fusecap.geometry.quaternions import to_wxyz
@@ -66,8 +67,13 @@ class Known:
 def keypoints_message(sample: CameraSample) -> str:
     return (
         f'{{"camera":{sample.camera},"timestamp_ns":{sample.timestamp_ns},'
-        f'"people":{_numbers(sample.people)}}}'
+        f'"people":{_numbers(sample.people)}{_appearance(sample)}}}'
     )
+
+
+def _appearance(sample: CameraSample) -> str:
+    looks = sample.appearance
+    return "" if looks is None or not looks.any() else f',"appearance":{looks.tolist()}'
 
 
 def imu_message(sample: ImuSample) -> str:
@@ -118,13 +124,15 @@ def _numbers(values: np.ndarray | np.float64) -> str:
     return str(values.tolist()).replace("nan", "null").replace("inf", "1e999")
 
 
-def _object(title: str, description: str, **properties: Any) -> dict[str, Any]:
+def _object(
+    title: str, description: str, optional: tuple[str, ...] = (), **properties: Any
+) -> dict[str, Any]:
     return {
         "title": title,
         "description": description,
         "type": "object",
         "properties": properties,
-        "required": list(properties),
+        "required": [name for name in properties if name not in optional],
     }
 
 
@@ -143,9 +151,14 @@ SCHEMAS = {
         _object(
             KEYPOINTS,
             "Everyone the detector found in one picture of one camera.",
+            optional=("appearance",),
             camera={"type": "integer", "description": "In the order of the rig."},
             timestamp_ns=_TIME,
             people=_list(_list(_ROW, "x [px], y [px], confidence 0-1"), "Per person, per keypoint"),
+            appearance=_list(
+                _list({"type": "integer"}, "40 numbers of 0-255, all 0 where not seen"),
+                "Per person how the clothes look; absent without pictures",
+            ),
         ),
         _object(
             IMU,
@@ -202,7 +215,14 @@ def _keypoints(values: Mapping[str, Any], known: Known) -> CameraSample:
         people = people.reshape(0, known.landmarks, 3)
     if people.shape[1:] != (known.landmarks, 3):
         raise ValueError(f"keypoints {people.shape}")
-    return CameraSample(camera=camera, timestamp_ns=_time_ns(values), people=people)
+    looks = None
+    if "appearance" in values:
+        looks = np.array(values["appearance"], dtype=np.uint8)
+        if looks.shape != (len(people), APPEARANCE_SIZE):
+            raise ValueError(f"appearance {looks.shape}")
+    return CameraSample(
+        camera=camera, timestamp_ns=_time_ns(values), people=people, appearance=looks
+    )
 
 
 def _imu(values: Mapping[str, Any], known: Known) -> ImuSample:

@@ -1,10 +1,11 @@
 """OpenPose JSON: one folder per camera, one file per frame.
 
-    {"people": [{"pose_keypoints_2d": [x, y, confidence, ...]}, ...]}
+    {"people": [{"pose_keypoints_2d": [x, y, confidence, ...], "appearance": [0, 17, ...]}, ...]}
 
 The last number of a file's name is its frame. A frame without a file holds nobody. A keypoint at
 (0, 0) or with confidence 0 is missing: NaN, NaN, 0 from here on. Folders that fusecap wrote carry
-the frames' own times (`fusecap.sources.detection_files`).
+the frames' own times (`fusecap.sources.detection_files`), and how people's clothes look
+(`fusecap.appearance`); other programs' have no `appearance`.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from fusecap.believable import surest
+from fusecap.appearance import APPEARANCE_SIZE, unknown
+from fusecap.believable import believable_keypoints, surest_rows
 from fusecap.body.landmarks import LANDMARK_SETS, LandmarkSet
 from fusecap.errors import InputError
 from fusecap.inputs import KEYPOINTS, read_bytes
@@ -57,6 +59,8 @@ class KeypointTrack:
     """(F,) on the session's clock: frame / rate, or the video's own time, + offset."""
     people: Sequence[np.ndarray]
     """Per frame (n, K, 3): x [px], y [px], confidence 0-1; NaN, NaN, 0 where missing."""
+    appearance: Sequence[np.ndarray] | None = None
+    """Per frame (n, 40), uint8, how their clothes look; None where no picture told."""
     broken: tuple[str, ...]
     """Names of unreadable files, taken as frames without people."""
 
@@ -82,14 +86,19 @@ def read_keypoints(
     of another format; a broken file among good ones counts as a frame without people.
     """
     numbered = _numbered_files(folder)
-    people = PeopleStore(len(landmarks.landmark_names))
+    people = PeopleStore(len(landmarks.landmark_names), 3)
+    looks = PeopleStore(APPEARANCE_SIZE, dtype=np.uint8)
+    shown = False
     broken: list[str] = []
     for done, (_, path) in enumerate(numbered, start=1):
         try:
-            people.append(_read_frame(path, landmarks))
+            found, appearance = _read_frame(path, landmarks)
         except _BrokenFile:
-            people.append(np.empty((0, len(landmarks.landmark_names), 3)))
+            found, appearance = np.empty((0, len(landmarks.landmark_names), 3)), unknown(0)
             broken.append(os.path.basename(path))
+        people.append(found)
+        looks.append(appearance)
+        shown = shown or bool(appearance.any())
         if progress is not None:
             progress(f"camera '{name}'", done, len(numbered))
     if len(broken) == len(numbered):
@@ -116,6 +125,7 @@ def read_keypoints(
         step=step,
         times_s=times_s + offset_s,
         people=people,
+        appearance=looks if shown else None,
         broken=tuple(broken),
     )
 
@@ -168,13 +178,15 @@ def _numbered_files(folder: Path) -> list[tuple[int, str]]:
 def read_people(path: Path, landmarks: LandmarkSet) -> np.ndarray | None:
     """(n, K, 3) the people of one file; None for one that is truncated, garbled or gone."""
     try:
-        return _read_frame(str(path), landmarks)
+        return _read_frame(str(path), landmarks)[0]
     except _BrokenFile:
         return None
 
 
-def _read_frame(path: str, landmarks: LandmarkSet) -> np.ndarray:
-    flat = [values for values in _persons(path) if values]
+def _read_frame(path: str, landmarks: LandmarkSet) -> tuple[np.ndarray, np.ndarray]:
+    """People (n, K, 3), and how their clothes look (n, 40)."""
+    persons = [(values, looks) for values, looks in _persons(path) if values]
+    flat = [values for values, _ in persons]
     for values in flat:
         if len(values) != 3 * landmarks.keypoint_count:
             raise _wrong_count(path, landmarks, values)
@@ -182,29 +194,42 @@ def _read_frame(path: str, landmarks: LandmarkSet) -> np.ndarray:
         people = np.array(flat, dtype=np.float64).reshape(len(flat), landmarks.keypoint_count, 3)
     except (ValueError, TypeError, OverflowError):
         raise _BrokenFile from None
-    return without_missing(landmarks.of_keypoints(people))
+    people = _with_nan(landmarks.of_keypoints(people))
+    rows = surest_rows(people)
+    return people[rows], np.array([_bytes(looks) for _, looks in persons], np.uint8)[rows]
 
 
-def _persons(path: str) -> list[list[Any]]:
+def _persons(path: str) -> list[tuple[list[Any], Any]]:
     """Everyone's numbers in one file; OpenPose left `_2d` out of their key before 2018."""
     try:
         people = json.loads(read_bytes(path, KEYPOINTS))["people"]
-        flat = [
-            person["pose_keypoints_2d"] if "pose_keypoints_2d" in person else person[_OLD_KEY]
+        persons = [
+            (
+                person["pose_keypoints_2d"] if "pose_keypoints_2d" in person else person[_OLD_KEY],
+                person.get("appearance"),
+            )
             for person in people
         ]
-    except (ValueError, KeyError, TypeError, InputError, RecursionError):
+    except (ValueError, KeyError, TypeError, AttributeError, InputError, RecursionError):
         raise _BrokenFile from None
-    if not all(isinstance(values, list) for values in flat):
+    if not all(isinstance(values, list) for values, _ in persons):
         raise _BrokenFile
-    return flat
+    return persons
+
+
+def _bytes(looks: Any) -> list[int]:
+    """How somebody's clothes look; zeros for what cannot be that."""
+    if not isinstance(looks, list) or len(looks) != APPEARANCE_SIZE:
+        return [0] * APPEARANCE_SIZE
+    whole = all(isinstance(value, int) and 0 <= value <= 255 for value in looks)
+    return looks if whole else [0] * APPEARANCE_SIZE
 
 
 def sets_in(folder: Path) -> list[LandmarkSet]:
     """Those with as many keypoints as the first person in a folder; raises `InputError`."""
     for _, path in _numbered_files(folder):
         try:
-            counts = {len(values) / 3 for values in _persons(path) if values}
+            counts = {len(values) / 3 for values, _ in _persons(path) if values}
         except _BrokenFile:
             continue
         if counts:
@@ -217,11 +242,16 @@ def without_missing(people: np.ndarray) -> np.ndarray:
 
     Of a crowd the surest are kept, see `fusecap.believable`.
     """
+    people = _with_nan(people)
+    return people[surest_rows(people)]
+
+
+def _with_nan(people: np.ndarray) -> np.ndarray:
     confidence = people[:, :, 2]
     seen = np.any(people[:, :, :2] != 0, axis=2) & np.isfinite(confidence)
     people = np.where(seen[:, :, None], people, [np.nan, np.nan, 0.0])
     people[:, :, 2] = np.minimum(people[:, :, 2], 1.0)
-    return surest(people)
+    return believable_keypoints(people)
 
 
 def _wrong_count(path: str, landmarks: LandmarkSet, values: list[Any]) -> InputError:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from array import array
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
@@ -45,14 +46,17 @@ class _Frames(Sequence[np.ndarray]):
 class PeopleStore(_Frames):
     """Written once, read in any order."""
 
-    def __init__(self, landmarks: int) -> None:
-        self._landmarks = landmarks
+    def __init__(self, *numbers: int, dtype: type[np.generic] = np.float64) -> None:
+        """`numbers` is the shape of what is kept of one person."""
+        self._numbers = numbers
+        self._dtype = np.dtype(dtype)
+        self._bytes = math.prod(numbers) * self._dtype.itemsize
         self._spool = Spool()
         self._first = array("q", [0])
 
     def append(self, people: People) -> None:
         """The next frame's."""
-        self._spool.append(np.ascontiguousarray(people, dtype=np.float64).tobytes())
+        self._spool.append(np.ascontiguousarray(people, dtype=self._dtype).tobytes())
         self._first.append(self._first[-1] + len(people))
 
     def __len__(self) -> int:
@@ -61,9 +65,8 @@ class PeopleStore(_Frames):
     def at(self, frame: int) -> People:
         """As it was appended."""
         first, end = self._first[frame], self._first[frame + 1]
-        size = 24 * self._landmarks
-        raw = self._spool.read(first * size, (end - first) * size)
-        return np.frombuffer(raw, dtype=np.float64).reshape(end - first, self._landmarks, 3)
+        raw = self._spool.read(first * self._bytes, (end - first) * self._bytes)
+        return np.frombuffer(raw, dtype=self._dtype).reshape(end - first, *self._numbers)
 
 
 class _Changed(_Frames):

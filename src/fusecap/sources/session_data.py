@@ -16,7 +16,6 @@ from typing import TypeVar
 
 import numpy as np
 
-from fusecap.believable import surest_of_views
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.errors import FusecapError, SessionError
 from fusecap.findings import Finding
@@ -44,8 +43,9 @@ from fusecap.sources.session_sensors import (
 from fusecap.sources.sync_files import Clock, Clocks, read_sync
 from fusecap.sources.synchronizer import (
     MAX_GAP_S,
-    people_at,
+    detections_of,
     resample_imus,
+    seen_at,
 )
 from fusecap.sources.video import Video
 from fusecap.types import Detections, ImuReading
@@ -110,10 +110,7 @@ class SessionData:
     def detections(self, instant: int) -> Detections:
         """Everyone in every camera at one instant."""
         t_s = float(self.times_s[instant])
-        return Detections(
-            timestamp_ns=round(t_s * 1e9),
-            people=surest_of_views([people_at(track, t_s) for track in self.keypoints]),
-        )
+        return detections_of(round(t_s * 1e9), [seen_at(track, t_s) for track in self.keypoints])
 
     def frames(self) -> Iterator[tuple[int, Detections, dict[str, ImuReading]]]:
         """Per instant its timestamp [ns], the detections, and each subject's IMU reading."""

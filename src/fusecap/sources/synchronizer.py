@@ -11,16 +11,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from fusecap.appearance import unknown
+from fusecap.believable import surest_of_views
 from fusecap.geometry.camera import Y_UP_FROM_Z_UP
 from fusecap.geometry.quaternions import from_wxyz
 from fusecap.geometry.same_people import same_people
 from fusecap.sources.imu_files.track import ImuTrack
 from fusecap.sources.keypoint_files import KeypointTrack
-from fusecap.types import GRAVITY_M_S2, ImuReading
+from fusecap.types import GRAVITY_M_S2, Detections, ImuReading
 
 EXACT_S = 1e-6
 """A frame this close to an instant is taken as it is."""
@@ -32,41 +35,83 @@ GATE_EXTENTS = 0.25
 """Detections of two frames further apart than this share of a person's extent are two people."""
 
 
-Frame = tuple[float, np.ndarray]
-"""When one camera looked [s], and the people (n, K, 3) it saw."""
+class ViewOfPeople(NamedTuple):
+    """Whom one camera sees."""
+
+    people: np.ndarray
+    """(n, K, 3)."""
+    appearance: np.ndarray | None = None
+    """(n, 40) how their clothes look; None without pictures."""
+
+
+Frame = tuple[float, ViewOfPeople]
+"""When one camera looked [s], and whom it saw."""
 
 
 def people_at(track: KeypointTrack, t_s: float) -> np.ndarray:
-    """(n, K, 3): the camera's people at `t_s`; empty where there is no frame near.
+    """(n, K, 3): the people of `seen_at`."""
+    return seen_at(track, t_s).people
 
-    `people_amid` the frames around the instant; between frames that do not follow each other
+
+def seen_at(track: KeypointTrack, t_s: float) -> ViewOfPeople:
+    """Whom the camera sees at `t_s`; nobody where there is no frame near.
+
+    `seen_amid` the frames around the instant; between frames that do not follow each other
     nothing is interpolated.
     """
     after = int(np.searchsorted(track.times_s, t_s - EXACT_S))
     before, last = after - 1, len(track.frames) - 1
     in_a_row = 0 <= before < last and track.frames[after] == track.frames[before] + 1
-    found = people_amid(
-        (float(track.times_s[before]), track.people[before]) if before >= 0 else None,
-        (float(track.times_s[after]), track.people[after]) if after <= last else None,
+    found = seen_amid(
+        (float(track.times_s[before]), _seen_in(track, before)) if before >= 0 else None,
+        (float(track.times_s[after]), _seen_in(track, after)) if after <= last else None,
         t_s,
         period_s=1.0 / track.rate_hz,
         in_a_row=in_a_row,
     )
-    return np.empty((0, len(track.landmarks.landmark_names), 3)) if found is None else found
+    return (
+        ViewOfPeople(np.empty((0, len(track.landmarks.landmark_names), 3)))
+        if found is None
+        else found
+    )
 
 
-def people_amid(
+def _seen_in(track: KeypointTrack, frame: int) -> ViewOfPeople:
+    looks = track.appearance
+    return ViewOfPeople(track.people[frame], None if looks is None else looks[frame])
+
+
+def detections_of(
+    timestamp_ns: int, views: Sequence[ViewOfPeople], looked: tuple[bool, ...] | None = None
+) -> Detections:
+    """Everyone at one instant; of a view that is too full for all nobody's clothes are kept."""
+    people = surest_of_views([seen.people for seen in views])
+    appearance = None
+    if any(seen.appearance is not None for seen in views):
+        appearance = tuple(
+            seen.appearance
+            if seen.appearance is not None and len(seen.appearance) == len(some)
+            else unknown(len(some))
+            for some, seen in zip(people, views, strict=True)
+        )
+    return Detections(
+        timestamp_ns=timestamp_ns, people=people, looked=looked, appearance=appearance
+    )
+
+
+def seen_amid(
     before: Frame | None,
     after: Frame | None,
     t_s: float,
     *,
     period_s: float,
     in_a_row: bool = True,
-) -> np.ndarray | None:
-    """(n, K, 3): people at `t_s` from a camera's last frame before it and the first not before it.
+) -> ViewOfPeople | None:
+    """People at `t_s` from a camera's last frame before it and the first not before it.
 
     A frame within 1 us is taken as it is. Between two frames keypoints that both have are
-    interpolated; a keypoint or a person that only one of them has is missing. Where one of the
+    interpolated; a keypoint or a person that only one of them has is missing, and clothes look as
+    in the nearer one. Where one of the
     neighbours does not exist, or the camera froze between them (more than 0.1 s and 2.5 of its
     frame periods), the nearer holds for half a period; None where neither is so near.
     """
@@ -83,13 +128,16 @@ def people_amid(
     return nearest[1]
 
 
-def _between(first: np.ndarray, second: np.ndarray, share: float) -> np.ndarray:
+def _between(first: ViewOfPeople, second: ViewOfPeople, share: float) -> ViewOfPeople:
     """People in both frames, `share` (0-1) of the way from the first to the second."""
-    rows, columns = same_people(first, second, gate_extents=GATE_EXTENTS)
-    a, b = first[rows], second[columns]
+    rows, columns = same_people(first.people, second.people, gate_extents=GATE_EXTENTS)
+    a, b = first.people[rows], second.people[columns]
     mixed = a + share * (b - a)
     mixed[np.isnan(mixed[:, :, 0]), 2] = 0.0
-    return mixed[(mixed[:, :, 2] > 0).any(axis=1)]
+    kept = (mixed[:, :, 2] > 0).any(axis=1)
+    nearer, same = (first, rows) if share < 0.5 else (second, columns)
+    looks = nearer.appearance
+    return ViewOfPeople(mixed[kept], None if looks is None else looks[same][kept])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -142,9 +142,15 @@ class Keypoints(_Stored):
         super().__init__(f"camera '{track.name}'", times_s)
         self._camera = camera
         self._people = track.people
+        self._appearance = track.appearance
 
     def _item(self, row: int, stamp_ns: int) -> CameraSample:
-        return CameraSample(camera=self._camera, timestamp_ns=stamp_ns, people=self._people[row])
+        return CameraSample(
+            camera=self._camera,
+            timestamp_ns=stamp_ns,
+            people=self._people[row],
+            appearance=None if self._appearance is None else self._appearance[row],
+        )
 
 
 class HeldPictures(_Stored):
