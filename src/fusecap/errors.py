@@ -54,8 +54,18 @@ def nearest(name: str, known: Iterable[str]) -> str:
 def from_extra(extra: str) -> str:
     """How to install what an extra brings, by its own names: no index has a fusecap to extend."""
     brings = [
-        f"'{requirement.partition(';')[0].strip()}'"
+        f"'{_from_least(requirement.partition(';')[0].strip())}'"
         for requirement in metadata.requires("fusecap") or ()
         if requirement.replace("'", '"').endswith(f'extra == "{extra}"')
     ]
     return f"install fusecap's extra '{extra}', or what it brings: pip install {' '.join(brings)}"
+
+
+def _from_least(requirement: str) -> str:
+    """`numpy<3,>=2` as `numpy>=2,<3`."""
+    least = requirement.find(">=")
+    start = min((at for at in map(requirement.find, "<>=!~") if at >= 0), default=least)
+    if least < 0 or requirement[start:].startswith(">="):
+        return requirement
+    bounds = requirement[start:].split(",")
+    return requirement[:start] + ",".join(sorted(bounds, key=lambda bound: bound[:2] != ">="))

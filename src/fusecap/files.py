@@ -108,6 +108,7 @@ class Spool:
     IN_MEMORY = 1 << 22
 
     def __init__(self) -> None:
+        # It ends with this object, not with a block.
         self._file = tempfile.SpooledTemporaryFile(self.IN_MEMORY, prefix="fusecap-")  # noqa: SIM115
         self._length, self._at_end = 0, True
         weakref.finalize(self, self._file.close)

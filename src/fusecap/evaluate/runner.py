@@ -244,6 +244,8 @@ def _on_ray(
     waiting: Mapping[str, Any], work: Work, address: str, workers: int | None
 ) -> Iterator[Ended]:
     """One Ray task on one core per cell; nodes need this version of fusecap installed."""
+    # Else Ray builds every worker an environment of its own where we run under uv.
+    os.environ.setdefault("RAY_ENABLE_UV_RUN_RUNTIME_ENV", "0")
     try:
         import ray
         from ray.exceptions import RayError
