@@ -9,7 +9,6 @@ import sys
 
 from fusecap.evaluate.clothes_trials import TRIALS, occluder, re_entry
 
-
 FIRST_SEED = 1000
 """Faults and thresholds were looked for on those from 0."""
 
