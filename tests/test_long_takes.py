@@ -63,6 +63,16 @@ def test_a_full_disk_is_told_of(monkeypatch):
     monkeypatch.setattr(spool._file, "write", full)
     with pytest.raises(FusecapError, match=r"No space left.*TMPDIR"):
         spool.append(b"1")
+    monkeypatch.setattr(spool._file, "seek", full)
+    with pytest.raises(FusecapError, match=r"No space left.*TMPDIR"):
+        spool.read(0, 1)
+
+
+def test_what_an_interrupt_left_half_done_is_written_over():
+    spool = Spool()
+    spool.append(b"aabb")
+    spool.append(b"cc", at=2)
+    assert spool.read(0, 9) == b"aacc" and len(spool) == 4
 
 
 def test_quantiles_are_those_of_all_numbers_within_a_step(rng):

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 import window_twin
@@ -19,8 +20,8 @@ from fusecap.kernels import band
 from fusecap.solve import whole_motion
 from fusecap.solve.options import SolverOptions, Weights
 from fusecap.solve.pose_solver import ImuSites, PoseSolver
-from fusecap.solve.whole_motion import WholeMotion
-from fusecap.solve.window_solver import WindowSolver
+from fusecap.solve.whole_motion import AHEAD, PIECE, WholeMotion
+from fusecap.solve.window_solver import WindowSolver, Workspace
 from fusecap.types import GRAVITY_M_S2, ImuReading, Observation
 from scenes import IMU13, measure, pose_error_mm_deg, ring
 
@@ -461,3 +462,21 @@ def test_what_cannot_be_solved_leaves_the_poses():
     window._measured.steps[:] = 1 / RATE_HZ
     window.refine(5)
     assert np.isfinite(window.pose()).all()
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_error_bars_of_a_short_motion_are_its_own_whoever_was_solved_before(count):
+    """Motions share a workspace."""
+    mine, shared = solver(cameras=1), Workspace(PAPER21, PIECE + AHEAD)
+    bars = []
+    for busy in (False, True):
+        if busy:
+            before = WholeMotion(solver(), shared)
+            for one, pose in zip(observations(walk(40)), walk(40), strict=True):
+                before.push(one, pose)
+            before.end()
+        motion = WholeMotion(mine, shared)
+        for one, pose in zip(observations(walk(count), cameras=1), walk(count), strict=True):
+            motion.push(one, pose)
+        bars.append([settled.sigmas.bone_deg for settled in motion.end()])
+    assert_allclose(bars[0], bars[1], rtol=1e-9)

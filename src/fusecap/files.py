@@ -102,6 +102,22 @@ def plain(value: Any) -> Any:
     return value
 
 
+@contextlib.contextmanager
+def _room() -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise FusecapError(
+            f"no room in {tempfile.gettempdir()} for what a take needs while it is made "
+            f"({error.strerror or error}): set TMPDIR to a folder with more"
+        ) from error
+
+
+def _closed(file: Any) -> None:
+    with contextlib.suppress(OSError):  # of a full disk, which was told of
+        file.close()
+
+
 class Spool:
     """Bytes in an unnamed temporary file once they are many; gone when nobody holds it."""
 
@@ -111,30 +127,30 @@ class Spool:
         # It ends with this object, not with a block.
         self._file = tempfile.SpooledTemporaryFile(self.IN_MEMORY, prefix="fusecap-")  # noqa: SIM115
         self._length, self._at_end = 0, True
-        weakref.finalize(self, self._file.close)
+        weakref.finalize(self, _closed, self._file)
 
     def __len__(self) -> int:
         return self._length
 
-    def append(self, data: bytes) -> None:
-        """Raises `FusecapError` where the disk is full."""
-        try:
-            if not self._at_end:
-                self._file.seek(self._length)
-                self._at_end = True
+    def append(self, data: bytes, at: int | None = None) -> None:
+        """At the end, or `at` a byte which then ends what was there.
+
+        Raises `FusecapError` where the disk is full.
+        """
+        at = self._length if at is None else at
+        with _room():
+            if not self._at_end or at != self._length:
+                self._file.seek(at)
+            self._at_end = False
             self._file.write(data)
-        except OSError as error:
-            raise FusecapError(
-                f"no room in {tempfile.gettempdir()} for what a take needs while it is made "
-                f"({error.strerror or error}): set TMPDIR to a folder with more"
-            ) from error
-        self._length += len(data)
+        self._length, self._at_end = at + len(data), True
 
     def read(self, first: int, count: int) -> bytearray:
-        """So many bytes from the `first`; fewer at the end."""
-        self._file.seek(first)
-        self._at_end = False
-        return bytearray(self._file.read(count))
+        """So many bytes from the `first`; fewer at the end. Fails as `append`, which may wait."""
+        with _room():
+            self._at_end = False
+            self._file.seek(first)
+            return bytearray(self._file.read(count))
 
     def parts(self) -> Iterator[bytearray]:
         """All of it, piece by piece."""

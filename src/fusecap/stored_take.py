@@ -55,6 +55,9 @@ class StoredTake:
         self.timestamps_ns: Int[np.ndarray, " t"] = array("timestamps_ns").astype(np.int64)
         self.tracked: Bool[np.ndarray, "s t"] = array("tracked").astype(bool)
         names = tuple(array("subject_names").tolist())
+        provenance = json.loads(str(array("provenance")))
+        if not isinstance(provenance, dict):
+            raise ValueError("provenance is no table")
         bone_names = tuple(array("bone_names").tolist())
         s, t, b = len(names), len(self.timestamps_ns), len(bone_names)
         self._motion = {name: self._file.rows(name) for name in MOTION}
@@ -79,7 +82,7 @@ class StoredTake:
                 heights_m=array("heights_m").astype(np.float64),
                 offsets_m=array("offsets_m").astype(np.float64),
                 tracked=self.tracked[:, :0],
-                provenance=json.loads(str(array("provenance"))),
+                provenance=provenance,
                 **{name: np.empty(array_shapes(s, 0, b)[name]) for name in MOTION},
             )
         except TakeError as error:

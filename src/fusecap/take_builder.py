@@ -105,7 +105,9 @@ class _Person:
 
     def add(self, frame: int, estimate: Estimate) -> None:
         numbers = (estimate.theta, estimate.bone_sigma_deg, estimate.position_sigma_m)
-        self._spool.append(np.concatenate(numbers).tobytes())
+        # Whatever an interrupt left half done is written over.
+        at = 8 * self._columns * len(self.frames)
+        self._spool.append(np.concatenate(numbers).tobytes(), at)
         self.frames.append(frame)
 
     def between(self, first: int, end: int) -> tuple[np.ndarray, np.ndarray]:

@@ -37,7 +37,8 @@ def inputs_beside(path: Path, take: Take) -> tuple[Path | None, str]:
     expected = take.provenance.get("session_sha256")
     if not expected:
         return None, "the take does not say what it was solved from; name it with --session"
-    recording = path.with_name(path.stem.removesuffix("-as-live") + SUFFIX)
+    stem = path.stem.removesuffix("-interrupted").removesuffix("-as-live")
+    recording = path.with_name(stem + SUFFIX)
     session = path.with_name(FILE_NAME)
     changed = ""
     try:

@@ -24,6 +24,10 @@ SEEDING_WINDOW = 4
 long window would not find out that people walk."""
 
 
+SURE = 60.0
+"""Of what sensors fit worse, summed over instants: for a second or two nobody was exchanged."""
+
+
 @runtime_checkable
 class Instants(Protocol):
     """Recorded measurements on the solve's instants."""
@@ -113,6 +117,8 @@ def _sensors_began(
     since = instant
     for row in range(instant - 1, -1, -1):
         readings, points = instants.readings(row), assigned.landmarks_m(row)
+        if most - gain > SURE or not points.keys() & {*renumbered, *renumbered.values()}:
+            break
         for former, number in renumbered.items():
             name = wearers.get(number, "")
             if name in readings and number in points:

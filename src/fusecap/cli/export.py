@@ -83,7 +83,12 @@ def export(
 def already(
     path: Path, *, format: str, out: Path | None, unit: str | None, rig: str, session: Path | None
 ) -> dict[str, Any] | None:
-    """What was exported of a take before; None where some of it is missing, or older."""
+    """What was exported of a take before; None where some of it is missing, or older.
+
+    What cameras of a session have to do with is written again: its files may have changed.
+    """
+    if session is not None:
+        return None
     _, planned = _plan(path, out, format, unit, rig, session)
     files = [file.path for file in planned]
     return {"files": [str(file) for file in files]} if are_newer(files, [path]) else None

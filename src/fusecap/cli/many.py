@@ -19,7 +19,7 @@ from typing import Annotated, Any
 import typer
 
 from fusecap.cli.common import print_json
-from fusecap.cli.terminal import console, err, progress, remark, table_of
+from fusecap.cli.terminal import console, err, note, progress, remark, table_of
 from fusecap.errors import FusecapError, InputError
 
 Workers = Annotated[
@@ -55,10 +55,10 @@ def run_one(one: OneOfMany) -> dict[str, Any]:
         known = None if one.again else module.already(one.path, **one.options)
         if known is not None:
             return {**known, "already": True}
-        out = StringIO()
-        with redirect_stdout(out), redirect_stderr(StringIO()), suppress(typer.Exit):
+        out, said = StringIO(), StringIO()
+        with redirect_stdout(out), redirect_stderr(said), suppress(typer.Exit):
             getattr(module, one.command)([one.path], **one.options, as_json=True)
-        return json.loads(out.getvalue())
+        return json.loads(out.getvalue()) | {"said": said.getvalue().splitlines()}
     except FusecapError as error:
         return {"error": str(error)}
 
@@ -80,6 +80,8 @@ def matching(paths: Sequence[Path], *, wanted: Callable[[Path], bool], what: str
             continue
         matches = map(Path, sorted(glob.glob(str(path.expanduser()), recursive=True)))
         some = [match for match in matches if wanted(match)]
+        # A recording that was solved is there as its take.
+        some = [path for path in some if wanted is not is_take_file or not _is_solved(path, some)]
         if not some:
             raise InputError(f"{path}: no {what} matches this pattern")
         found += some
@@ -96,10 +98,15 @@ def is_session(path: Path) -> bool:
 
 
 def is_take_file(path: Path) -> bool:
-    """What may be a take, or a recording; a broken one is found out when it is opened."""
+    """A take, or a recording, by its name; a broken one is found out when it is opened."""
+    from fusecap.exports.formats.npz import FORMAT
     from fusecap.recording.layout import SUFFIX
 
-    return path.suffix in (SUFFIX, ".npz")
+    return path.suffix in (SUFFIX, ".npz") and FORMAT.tag not in path.suffixes
+
+
+def _is_solved(path: Path, others: Sequence[Path]) -> bool:
+    return path.suffix != ".npz" and path.with_suffix(".npz") in others
 
 
 def _resolved(path: Path) -> Path:
@@ -155,6 +162,8 @@ def run_many(
             for path, result, error, seconds in compute(jobs, run_one, workers=workers, ray=ray):
                 outcome = {"error": error} if result is None else dict(result)
                 ended[path] = {**outcome, "seconds": round(seconds, 3)}
+                for line in () if as_json else outcome.get("said", ()):
+                    note(f"{path}: {line}")
                 if "error" in outcome and not as_json:
                     remark(("failed", "bold red"), f"{path}: {outcome['error']}")
                 show(command, len(ended), len(jobs))

@@ -74,9 +74,15 @@ def report(
 
 
 def already(path: Path) -> dict[str, Any] | None:
-    """The page of a take, where it is newer."""
-    page = _target(path)
-    return {"files": [str(page)], "notes": []} if are_newer([page], [path]) else None
+    """The page of a take, where it is newer than the take and the session beside it."""
+    from fusecap.sources.session import FILE_NAME
+    from fusecap.sources.session_file import input_files, load_session
+
+    page, session = _target(path), path.with_name(FILE_NAME)
+    inputs = [path]
+    if session.is_file():
+        inputs += input_files(load_session(session))
+    return {"files": [str(page)], "notes": []} if are_newer([page], inputs) else None
 
 
 def _target(take: Path) -> Path:

@@ -83,10 +83,15 @@ class FbxFile:
     @classmethod
     def read(cls, data: bytes) -> FbxFile:
         """Raises `InputError` for another version than those from 7.0 up to 7.4."""
-        version = struct.unpack_from("<I", data, len(_HEAD))[0]
-        if not data.startswith(_HEAD) or version not in _VERSIONS:
-            raise InputError(f"expected binary FBX 7.0 to 7.4, found version {version / 1000:g}")
-        elements, at = _read_elements(data, len(_HEAD) + 4)
+        if not data.startswith(_HEAD):
+            raise InputError("expected binary FBX, found something else")
+        try:
+            version = struct.unpack_from("<I", data, len(_HEAD))[0]
+            if version not in _VERSIONS:
+                raise InputError(f"expected FBX 7.0 to 7.4, found version {version / 1000:g}")
+            elements, at = _read_elements(data, len(_HEAD) + 4)
+        except (struct.error, IndexError, StopIteration):
+            raise InputError("the FBX file ends in its middle") from None
         return cls(version, elements, data[at : at + _FOOT_BYTES])
 
     def named(self, name: bytes) -> FbxElement:

@@ -119,6 +119,7 @@ class WindowSolver:
         """Forget everything; the next instant begins a motion."""
         self.count = 0
         self._prior = None
+        self._eliminated = False
 
     def goes_on(self, timestamp_ns: int) -> bool:
         """Whether an instant follows the newest without a gap."""
@@ -180,7 +181,8 @@ class WindowSolver:
             positive = band.eliminate(hessian, gradient, n, damping, _RIDGE, workspace.square[0])
             self._newest[:] = hessian[n - 1, 0]
             promised = 0.5 * float(np.vdot(gradient, gradient))
-            if positive and tolerance is not None and promised <= tolerance * cost:
+            near = positive and damping <= _DAMPING
+            if near and tolerance is not None and promised <= tolerance * cost:
                 self._eliminated = True
                 break
             trial_cost = np.inf
@@ -189,7 +191,7 @@ class WindowSolver:
                 np.add(theta, step, out=trial)
                 trial_cost = self._evaluate(trial)
             if not trial_cost < cost:
-                damping *= 10.0
+                damping = max(10.0 * damping, _DAMPING)
                 cost = self._evaluate(theta)
                 continue
             decrease = cost - trial_cost
@@ -257,10 +259,12 @@ class WindowSolver:
         return self._spread(self.count - 1)
 
     def spreads(self, count: int) -> tuple[Float[np.ndarray, "n b"], Float[np.ndarray, "n b"]]:
-        """The same of the oldest instants, by all that the window holds, once it is refined."""
+        """The same of the oldest instants, by all that the window holds."""
         workspace, square, n = self._workspace, self._workspace.square[0], self.count
         hessian, gradient = workspace.hessian[:n], workspace.gradient[:n]
         turn, place = np.full((2, n, self._solver.skeleton.bone_count), np.nan)
+        if not self._eliminated:
+            self._evaluate(self._theta[:n])
         if self._eliminated or band.eliminate(hessian, gradient, n, 0.0, _RIDGE, square):
             for t in range(n - 1, -1, -1):
                 uncertainty.step_back(hessian, t, workspace.covariances, self._covariance, square)
