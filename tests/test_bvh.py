@@ -202,11 +202,11 @@ def test_odd_names_become_file_names_that_stay_apart(tmp_path):
     paths = export_take(take, tmp_path / "out", format="bvh", stem="my take")
     assert [p.parent for p in paths] == [tmp_path / "out"] * 5
     assert [p.name for p in paths] == [
-        "my_take_______etc_x.bvh",
-        "my_take_a_b.bvh",
-        "my_take_a_b_2.bvh",
-        "my_take_unnamed.bvh",
-        "my_take_Zoë.bvh",
+        "my take_______etc_x.bvh",
+        "my take_a_b.bvh",
+        "my take_a_b_2.bvh",
+        "my take_unnamed.bvh",
+        "my take_Zoë.bvh",
     ]
 
 

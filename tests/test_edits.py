@@ -1,6 +1,7 @@
 """Clean-up does what it says, tells it, and touches nothing else."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from export_people import degrees_apart, two_walkers, with_gap
+from fusecap.batch.report_page import report_page
 from fusecap.body.skeleton import PAPER21
 from fusecap.cli import app
 from fusecap.edits.edit import EditOptions, edit_take
@@ -48,6 +50,16 @@ def test_one_person_renamed_trimmed_and_lowered():
     assert done == ["only", "rename", "trim", "floor shift"]
     again = edited(out, floor_shift_m=0.03)
     assert [entry["edit"] for entry in again.provenance["edits"]] == [*done, "floor shift"]
+
+
+def test_the_report_of_a_solve_is_not_that_of_an_edited_take():
+    take = two_walkers(20)
+    solved = replace(take, provenance={**take.provenance, "report": {"instants": 20}})
+    for out in (edited(solved, only=("ben",)), edited(edited(solved, start_s=0.1), only=("ben",))):
+        assert "report" not in out.provenance
+        assert out.provenance["report_before_edits"] == {"instants": 20}
+        assert "Of the take before its edits." in report_page(out, "t", seen=None)
+    assert "report_before_edits" not in edited(take, only=("ben",)).provenance
 
 
 @given(st.lists(st.booleans(), max_size=30))

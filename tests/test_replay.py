@@ -33,6 +33,7 @@ from fusecap.sources.session import Session
 from fusecap.sources.session_data import open_session
 from fusecap.sources.session_file import load_session
 from fusecap.stored_take import load_take
+from fusecap.take import save_take
 from fusecap.types import GRAVITY_M_S2, CameraSample, Command, CommandKind, ImuSample, Tick
 from fusecap.viewer.recording import RecordedDetections
 from live_events import same_bits
@@ -184,6 +185,32 @@ def test_instants_years_apart_are_refused(run, tmp_path):
     recording = written(tmp_path / "far.mcap", setup, [*taken, *far])
     with pytest.raises(InputError, match="too many"):
         solve_recording(recording)
+
+
+def test_what_is_made_from_a_recording_and_from_its_take_stands_side_by_side(recorded, tmp_path):
+    """`run.mcap` is solved to `run.npz`: no command takes files of the one for the other's."""
+    path, take = tmp_path / "run.mcap", tmp_path / "run.npz"
+    path.write_bytes(recorded.read_bytes())
+    makers = (["export", "--format", "csv,html"], ["angles"], ["report"])
+    made = {}
+    for source in (path, take):
+        if source == take:
+            save_take(recorded_take(Recording(path)), take)
+        before = {file: file.read_bytes() for file in tmp_path.iterdir()}
+        for name, *options in makers:
+            result = CliRunner().invoke(app, [name, str(source), *options])
+            assert result.exit_code == 0, result.output
+        assert {file: file.read_bytes() for file in before} == before
+        made[source] = {file.name for file in tmp_path.iterdir()} - {file.name for file in before}
+    assert made[path] == {f"run.live{end}" for end in MADE}
+    assert made[take] == {f"run{end}" for end in MADE}
+    result = CliRunner().invoke(app, ["solve", str(path), "--as-live", "--out", str(take)])
+    assert result.exit_code == 0, result.output
+    left = {file.name for file in tmp_path.iterdir()}
+    assert made[path] <= left and not left & made[take]
+
+
+MADE = (".csv", ".html", "_angles.csv", "_report.html", ".files.json")
 
 
 def test_commands_solve_and_check_a_recording(recorded, tmp_path):

@@ -27,7 +27,7 @@ from fusecap.exports.overlay import (
     overlay_writer,
 )
 from fusecap.exports.stick_figures import TakeSticks
-from fusecap.files import distinct_names, safe_name
+from fusecap.files import distinct_names
 from fusecap.geometry.camera import Camera
 from fusecap.progress import Progress
 from fusecap.sources.keypoint_files import KeypointTrack, read_people
@@ -98,7 +98,7 @@ def draw_take(
             track = replace(track, times_s=clock.session_s(track.times_s))
         times_s = video_times_s(session, camera, video)
         solved = _Solved(take, rig[camera.name], video, times_s, track)
-        target = folder / f"{safe_name(stem)}_{name}_overlay.mp4"
+        target = folder / f"{stem}_{name}_overlay.mp4"
         if any(target.resolve() == each.resolve() for _, each in shown):
             raise InputError(f"{target} is a video of the session; name another folder with --out")
         jobs.append(_Job(name=camera.name, video=video, path=target, paint=solved.paint))

@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
 from fusecap.batch.seen import Seen
+from fusecap.edits.edit import SOLVE_REPORT
 from fusecap.feet import foot_events, standing
 from fusecap.findings import Finding
 from fusecap.take import Take
@@ -49,7 +50,7 @@ def report_page(
     notes: Sequence[str] = (),
 ) -> str:
     """The whole page; `notes` say what is missing in it and why."""
-    solve = take.provenance.get("report")
+    solve = take.provenance.get("report", take.provenance.get(SOLVE_REPORT))
     solve = solve if isinstance(solve, Mapping) else {}
     with matplotlib.rc_context({"svg.fonttype": "none", "text.parse_math": False}):
         parts = [
@@ -260,6 +261,8 @@ def _contacts(take: Take) -> Iterable[str]:
 def _solve(take: Take, solve: Mapping[str, Any]) -> Iterable[str]:
     yield "<h2>The solve</h2>"
     if solve:
+        if SOLVE_REPORT in take.provenance:
+            yield '<p class="quiet">Of the take before its edits.</p>'
         statuses = solve.get("statuses")
         ended = statuses.items() if isinstance(statuses, Mapping) else ()
         yield _table(

@@ -96,7 +96,9 @@ def already(path: Path, *, mot: bool, plot: bool, gait: bool) -> dict[str, Any] 
 
 
 def _target(take: Path) -> Path:
-    return take.with_name(f"{take.stem}_angles.csv")
+    from fusecap.exports.made_files import made_stem
+
+    return take.with_name(f"{made_stem(take)}_angles.csv")
 
 
 def _angles_of(

@@ -110,7 +110,7 @@ def write_take(solved: Solved, path: Path, exports: Exports, *, picture: bool) -
     solve's report. What an interrupted solve has goes beside `path`, by names of its own: a whole
     take stays.
     """
-    from fusecap.exports.made_files import list_made
+    from fusecap.exports.made_files import list_made, made_stem
     from fusecap.exports.take_files import held_poses, plan_files
 
     if solved.report.interrupted:
@@ -121,7 +121,7 @@ def write_take(solved: Solved, path: Path, exports: Exports, *, picture: bool) -
             solved.take,
             path.parent,
             formats=exports.formats,
-            stem=path.stem,
+            stem=made_stem(path),
             unit=exports.unit,
             rig=exports.rig,
             options=exports.options,

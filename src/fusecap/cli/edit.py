@@ -55,9 +55,10 @@ def edit(
     """
     from fusecap.batch.replay import open_take
     from fusecap.edits.edit import EditOptions, edit_take
+    from fusecap.exports.made_files import made_stem
     from fusecap.take import save_take
 
-    target = out or take.with_name(f"{take.stem}-edited.npz")
+    target = out or take.with_name(f"{made_stem(take)}-edited.npz")
     if target.suffix != ".npz":
         raise InputError(f"--out {target}: a take is one .npz file")
     if target.resolve() == take.resolve():

@@ -59,12 +59,14 @@ def export(
     A file's name says what is not usual: .cm, a rig. Of a recording: the poses as they were sent
     in the run; fusecap solve makes better ones.
     """
+    from fusecap.exports.made_files import made_stem
+
     if not is_pattern(take):
         _export_one(take[0], out, format, unit, rig, session, as_json=as_json)
         return
     checked_exports("--format", format, unit, rig)
     paths = matching(take, wanted=is_take_file, what="take or recording")
-    if out is not None and len({path.stem for path in paths}) < len(paths):
+    if out is not None and len({made_stem(path) for path in paths}) < len(paths):
         raise InputError(f"--out {out}: two of the takes have the same name; leave it out")
     options = {"format": format, "out": out, "unit": unit, "rig": rig, "session": session}
     run_many(
@@ -98,6 +100,7 @@ def _plan(
     take: Path, out: Path | None, format: str, unit: str | None, rig: str, session: Path | None
 ) -> tuple[Take, list[TakeFile]]:
     from fusecap.batch.replay import open_take
+    from fusecap.exports.made_files import made_stem
     from fusecap.exports.take_files import plan_files
     from fusecap.exports.take_format import ExportOptions
     from fusecap.sources.session_cameras import common_landmarks, open_rig
@@ -113,7 +116,7 @@ def _plan(
         opened,
         out or take.parent,
         formats=exports.formats,
-        stem=take.stem,
+        stem=made_stem(take),
         unit=exports.unit,
         rig=exports.rig,
         options=options,

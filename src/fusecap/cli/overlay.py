@@ -39,7 +39,7 @@ def overlay(
     """
     from fusecap.batch.overlay import draw_take
     from fusecap.batch.replay import open_take
-    from fusecap.exports.made_files import list_made
+    from fusecap.exports.made_files import list_made, made_stem
     from fusecap.files import check_writable
     from fusecap.sources.session import FILE_NAME
     from fusecap.sources.session_cameras import with_detections
@@ -55,7 +55,7 @@ def overlay(
     loaded = with_detections(load_session(session or beside))
     with progress(quiet=as_json) as show:
         opened = open_take(take, show)
-        drawn = draw_take(opened, loaded, folder, take.stem, show)
+        drawn = draw_take(opened, loaded, folder, made_stem(take), show)
     list_made(take, drawn.files)
     if as_json:
         files = [str(path) for path in drawn.files]

@@ -86,7 +86,9 @@ def already(path: Path) -> dict[str, Any] | None:
 
 
 def _target(take: Path) -> Path:
-    return take.with_name(f"{take.stem}_report.html")
+    from fusecap.exports.made_files import made_stem
+
+    return take.with_name(f"{made_stem(take)}_report.html")
 
 
 def _report_of(take: Path, session: Path | None, out: Path | None, *, as_json: bool) -> None:
@@ -118,7 +120,6 @@ def _report_of(take: Path, session: Path | None, out: Path | None, *, as_json: b
             findings = inputs.findings
     page = report_page(opened, take.stem, seen=seen, findings=findings, notes=notes)
     write_whole(target, page)
-    list_made(take, [target])
     list_made(take, [target])
     if as_json:
         result: dict[str, Any] = {"files": [str(target)], "notes": notes}

@@ -40,10 +40,10 @@ def retarget(
     """
     from fusecap.batch.replay import open_take
     from fusecap.exports.characters.retarget import retarget as onto
-    from fusecap.exports.made_files import list_made
+    from fusecap.exports.made_files import list_made, made_stem
 
     whose = "" if subject is None else f"_{safe_name(subject)}"
-    stem = f"{take.stem}{whose}_{safe_name(character.stem)}"
+    stem = f"{made_stem(take)}{whose}_{safe_name(character.stem)}"
     ending = ".fbx" if character.suffix.lower() == ".fbx" else ".glb"
     done = onto(
         open_take(take),

@@ -112,6 +112,7 @@ def solve(
 def already(path: Path, **options: Any) -> dict[str, Any] | None:
     """The report of a take that is newer than all that its session names, with all exports."""
     from fusecap.errors import TakeError
+    from fusecap.exports.made_files import made_stem
     from fusecap.exports.take_files import plan_files
     from fusecap.recording.layout import SUFFIX
     from fusecap.sources.session_file import input_files, load_session
@@ -139,7 +140,7 @@ def already(path: Path, **options: Any) -> dict[str, Any] | None:
                 load_take(target),
                 target.parent,
                 formats=exports.formats,
-                stem=target.stem,
+                stem=made_stem(target),
                 unit=exports.unit,
                 rig=exports.rig,
                 options=exports.options,

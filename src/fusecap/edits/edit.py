@@ -14,6 +14,9 @@ from fusecap.edits.gaps import fill_gaps, mark_gaps
 from fusecap.errors import InputError
 from fusecap.take import Take, made_by
 
+SOLVE_REPORT = "report_before_edits"
+"""Where an edited take's provenance has the report of its solve: people and frames were others."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EditOptions:
@@ -83,10 +86,13 @@ def edit_take(take: Take, options: EditOptions) -> Take:
         done.append({"edit": "foot lock", "strength": options.foot_lock, "stances": stances})
     if not done:
         raise InputError("no edit was asked for: nothing would change")
-    earlier = list(take.provenance.get("edits", ()))
+    told = dict(take.provenance)
     for entry in done:
         entry["made_by"] = made_by()
-    return replace(take, provenance={**take.provenance, "edits": earlier + done})
+    told["edits"] = [*told.get("edits", ()), *done]
+    if "report" in told:
+        told[SOLVE_REPORT] = told.pop("report")
+    return replace(take, provenance=told)
 
 
 def _trimmed(take: Take, start_s: float | None, end_s: float | None) -> Take:

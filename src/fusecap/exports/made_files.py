@@ -4,7 +4,10 @@
 
 Whoever writes another take to that name sets those files aside, `duo_anna.earlier1.bvh`: nobody
 takes them for results of the take beside them, and nothing is lost. Only files with the take's name
-in front are listed; what has a name of its own is its owner's.
+in front are listed; what has a name of its own is its owner's. What is made from a recording has
+`.live` in its name, for the take that it is solved to stands beside it under the same name:
+
+    duo.mcap   duo.live.files.json  {"files": ["duo.live_anna.bvh"]}
 """
 
 from __future__ import annotations
@@ -17,10 +20,15 @@ from pathlib import Path
 
 from fusecap.errors import InputError, TakeError
 from fusecap.exports.formats import FORMATS, format_named
-from fusecap.files import safe_name, write_whole
+from fusecap.files import write_whole
 from fusecap.inputs import MADE_FILES, read_json
 
 _EARLIER = "earlier"
+
+
+def made_stem(take: Path) -> str:
+    """What the names of files made from the take or recording at `take` begin with."""
+    return take.stem if take.suffix == ".npz" else f"{take.stem}.live"
 
 
 def list_made(take: Path, files: Iterable[Path]) -> None:
@@ -41,7 +49,7 @@ def set_aside_others(take: Path, files: Iterable[Path]) -> list[Path]:
 
 
 def _list_path(take: Path) -> Path:
-    return take.with_name(f"{take.stem}.files.json")
+    return take.with_name(f"{made_stem(take)}.files.json")
 
 
 def _listed(take: Path) -> set[str]:
@@ -72,8 +80,7 @@ def _write_list(take: Path, names: set[str]) -> None:
 def _could_be_of(take: Path, name: str) -> bool:
     """A list is text that anybody can write: it names no inputs and nothing elsewhere."""
     endings = {*(format_named(each).suffix for each in FORMATS), ".png", ".vrm", ".mp4"}
-    stems = "|".join(re.escape(stem) for stem in (take.stem, safe_name(take.stem)))
-    ours = re.fullmatch(rf"(?:{stems})[_.][^/\\\0]+", name)
+    ours = re.fullmatch(rf"{re.escape(made_stem(take))}[_.][^/\\\0]+", name)
     return ours is not None and name != take.name and Path(name).suffix.lower() in endings
 
 

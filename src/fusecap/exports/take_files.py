@@ -17,7 +17,7 @@ from fusecap.body.rigs import rig_preset
 from fusecap.errors import InputError, TakeError, nearest
 from fusecap.exports.formats import FORMATS, format_named
 from fusecap.exports.take_format import UNITS_PER_M, ExportOptions, TakeFormat
-from fusecap.files import distinct_names, safe_name
+from fusecap.files import distinct_names
 from fusecap.take import Take
 
 _SPANS_TOLD = 3
@@ -87,7 +87,7 @@ def export_take(
     a take with nobody in it.
     """
     return write_files(
-        take, _planned(take, Path(folder) / safe_name(stem), *_checked(format, unit, rig, options))
+        take, _planned(take, Path(folder) / stem, *_checked(format, unit, rig, options))
     )
 
 
@@ -103,10 +103,11 @@ def plan_files(
 ) -> list[TakeFile]:
     """What to write in each format; a unit or a rig goes to the formats that have a choice.
 
+    `stem` begins the files' names: see `made_stem`.
     Raises `InputError` where none of them has that choice.
     """
     chosen = check_formats(formats, unit=unit, rig=rig, options=options)
-    base = Path(folder) / safe_name(stem)
+    base = Path(folder) / stem
     return [file for each in chosen for file in _planned(take, base, *each)]
 
 
