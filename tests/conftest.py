@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,8 @@ from hypothesis import settings
 
 settings.register_profile("fusecap", deadline=None, derandomize=True)
 settings.load_profile("fusecap")
+# A shell lets what it puts into the background ignore Ctrl-C, which tests and their children press.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture

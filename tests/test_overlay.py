@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from dataclasses import replace
 
 import numpy as np
@@ -80,7 +81,7 @@ def test_ctrl_c_leaves_a_whole_video_and_the_earlier_one(scene, tmp_path):
 
     def stop(what: str, done: int, _: int) -> None:
         if what == "drawing cam1" and done == 5:
-            raise KeyboardInterrupt
+            signal.raise_signal(signal.SIGINT)
 
     made = drawn(scene, tmp_path, progress=stop)
     assert made.interrupted

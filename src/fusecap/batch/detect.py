@@ -36,6 +36,7 @@ from fusecap.detect.detector import Detector, DetectorOptions
 from fusecap.errors import InputError, SessionError
 from fusecap.exports import openpose
 from fusecap.files import distinct_names, plain
+from fusecap.interrupts import Interruption, ctrl_c_held
 from fusecap.pipeline import Pipeline
 from fusecap.progress import Progress
 from fusecap.setup import Setup, setup_of
@@ -195,12 +196,9 @@ def detect_videos(
     started = time.perf_counter()
     works = [_Work(camera, detector, progress) for camera in cameras]
     plan = every_frame([clock_times_ns(c.video, c.offset_s) for c in cameras])
-    interrupted = False
     loop_started = time.perf_counter()
-    try:
-        _detect(works, detector, plan, setup, progress)
-    except KeyboardInterrupt:
-        interrupted = True
+    with ctrl_c_held() as stop:
+        _detect(works, detector, plan, setup, progress, stop)
     loop_s = time.perf_counter() - loop_started
     if all(work.done.all() for work in works):
         for work in works:
@@ -213,7 +211,7 @@ def detect_videos(
         frames_detected=sum(work.written for work in works),
         frames_per_s=looked_at / loop_s if looked_at else float("nan"),
         elapsed_s=time.perf_counter() - started,
-        interrupted=interrupted,
+        interrupted=stop.asked,
         notes=tuple(note for work in works for note in work.notes()),
     )
 
@@ -224,6 +222,7 @@ def _detect(
     plan: FramePlan,
     setup: Setup | None,
     progress: Progress | None,
+    stop: Interruption,
 ) -> None:
     """Everything that has no file yet, and what comes before it in its block."""
     missing = np.stack([work.misses(plan.frame[:, i]) for i, work in enumerate(works)], axis=1)
@@ -257,6 +256,8 @@ def _detect(
         expected.learn(frames.timestamp_ns, people)
         if progress is not None:
             progress("detecting frames", sum(work.looked_at for work in works), total)
+        if stop.asked:
+            break
 
 
 def read_ahead(items: Iterable[T], count: int) -> Generator[T, None, None]:

@@ -29,6 +29,7 @@ from fusecap.exports.overlay import (
 from fusecap.exports.stick_figures import TakeSticks
 from fusecap.files import distinct_names
 from fusecap.geometry.camera import Camera
+from fusecap.interrupts import ctrl_c_held
 from fusecap.progress import Progress
 from fusecap.sources.keypoint_files import KeypointTrack, read_people
 from fusecap.sources.session import Session
@@ -165,21 +166,17 @@ class _Solved:
 def _draw(jobs: Iterable[_Job], progress: Progress | None) -> DrawnVideos:
     files: list[Path] = []
     for job in jobs:
-        info, drawn, interrupted = job.video.info, 0, False
+        info = job.video.info
         partial = job.path.with_name(f"{job.path.stem}_interrupted{job.path.suffix}")
-        with overlay_writer(partial, info.size_px, info.rate_hz) as writer:
-            try:
-                for frame in job.video.frames():
-                    job.paint(frame)
-                    writer.add(frame.image, frame.time_ns)
-                    drawn += 1
-                    if progress is not None:
-                        progress(f"drawing {job.name}", frame.number + 1, info.frames)
-            except KeyboardInterrupt:
-                interrupted = True
-                if not drawn:
-                    raise
-        if interrupted:
+        with ctrl_c_held() as stop, overlay_writer(partial, info.size_px, info.rate_hz) as writer:
+            for frame in job.video.frames():
+                job.paint(frame)
+                writer.add(frame.image, frame.time_ns)
+                if progress is not None:
+                    progress(f"drawing {job.name}", frame.number + 1, info.frames)
+                if stop.asked:
+                    break
+        if stop.asked:
             return DrawnVideos(files=[*files, partial], interrupted=True)
         files.append(partial.replace(job.path))
     return DrawnVideos(files=files, interrupted=False)

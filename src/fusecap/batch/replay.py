@@ -20,6 +20,7 @@ from fusecap.body.shape import REFERENCE_HEIGHT_M, BodyShape
 from fusecap.body.skeleton import Skeleton
 from fusecap.engine.engine import Engine, LiveStep
 from fusecap.errors import InputError
+from fusecap.interrupts import ctrl_c_held
 from fusecap.progress import Progress
 from fusecap.recording.index import RecordingIndex
 from fusecap.recording.layout import SUFFIX
@@ -97,8 +98,7 @@ def solve_as_live(recording: Recording, progress: Progress | None = None) -> tup
     )
     solve_s: list[float] = []
     statuses = Counter()
-    interrupted = False
-    try:
+    with ctrl_c_held() as stop:
         for step in again.steps(progress):
             people = [one for one in step.people.values() if one is not None]
             builder.add(step.timestamp_ns, people)
@@ -107,8 +107,8 @@ def solve_as_live(recording: Recording, progress: Progress | None = None) -> tup
             for estimate in step.step.estimates:
                 solve_s.append(estimate.solve_s)
                 statuses[estimate.status.name.lower()] += 1
-    except KeyboardInterrupt:
-        interrupted = True
+            if stop.asked:
+                break
     solve_ms = np.array(solve_s or [np.nan]) * 1e3
     report = SolveReport(
         instants=len(builder),
@@ -121,7 +121,7 @@ def solve_as_live(recording: Recording, progress: Progress | None = None) -> tup
         solves=len(solve_s),
         statuses=dict(statuses),
         elapsed_s=time.perf_counter() - started,
-        interrupted=interrupted,
+        interrupted=stop.asked,
         notes=(*loss_notes(recording), again.note()),
     )
     return Solved(builder=builder, report=report), again

@@ -30,6 +30,7 @@ from fusecap.checks import check_measurements
 from fusecap.errors import SessionError
 from fusecap.files import plain
 from fusecap.findings import Finding
+from fusecap.interrupts import ctrl_c_held
 from fusecap.progress import Progress
 from fusecap.setup import Setup, setup_of
 from fusecap.solve.quantiles import Quantiles
@@ -172,9 +173,8 @@ def solve_instants(
             simulated=simulated,
         ),
     )
-    second = SecondPass(setup, tracked.shapes)
     solve_s, statuses = array("d"), Counter()
-    interrupted = tracked.interrupted
+    what = "solving what is sorted" if tracked.interrupted else "solving"
 
     def keep(finished: Iterator[Instant]) -> None:
         for instant in finished:
@@ -184,8 +184,11 @@ def solve_instants(
                 subjects.add(estimate)
                 reprojection.add(estimate, observation.keypoints)
 
-    try:
+    with ctrl_c_held() as stop:
+        second = SecondPass(setup, tracked.shapes)
         for instant in range(len(assigned)):
+            if stop.asked:
+                break
             detections, readings = instants.detections(instant), instants.readings(instant)
             second.begin(tracked.begun.get(instant, ()))
             for seed in second.step(detections, readings, assigned[instant]):
@@ -193,10 +196,9 @@ def solve_instants(
                 statuses[seed.status.name.lower()] += 1
             keep(second.finished())
             if progress:
-                progress("solving", instant + 1, len(assigned))
-    except KeyboardInterrupt:
-        interrupted = True
-    keep(second.rest())
+                progress(what, instant + 1, len(assigned))
+        keep(second.rest())
+    interrupted = tracked.interrupted or stop.asked
     solve_ms = np.array(solve_s or [np.nan]) * 1e3
     return Solved(
         builder=builder,

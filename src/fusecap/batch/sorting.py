@@ -14,6 +14,7 @@ import numpy as np
 from fusecap.associate.sensor_vote import FITS, SensorVote
 from fusecap.batch.assignments import Assignments
 from fusecap.body.shape import BodyShape
+from fusecap.interrupts import Interruption, ctrl_c_held
 from fusecap.pipeline import Pipeline, Step, worn_sensors
 from fusecap.progress import Progress
 from fusecap.setup import Setup
@@ -59,22 +60,31 @@ def sort_instants(
     setup: Setup, instants: Instants, assigned: Assignments, progress: Progress | None
 ) -> Sorted:
     """Fill `assigned`; Ctrl-C ends it at the instant it had reached."""
+    with ctrl_c_held() as stop:
+        return _sort(setup, instants, assigned, progress, stop)
+
+
+def _sort(
+    setup: Setup,
+    instants: Instants,
+    assigned: Assignments,
+    progress: Progress | None,
+    stop: Interruption,
+) -> Sorted:
     window = min(setup.options.window, SEEDING_WINDOW)
     options = replace(setup.options, window=window, seeding=True)
     pipeline = Pipeline(replace(setup, options=options))
     notes: list[str] = []
     moved: list[tuple[int, Step]] = []
-    interrupted = False
-    try:
-        for instant in range(len(instants)):
-            step = pipeline.step(instants.detections(instant), instants.readings(instant))
-            assigned.add([*step.updates, *step.bystanders], step.estimates)
-            notes += [f"{instant / setup.rate_hz:.2f} s: {note}" for note in step.notes]
-            moved += [(instant, step)] if step.renumbered else []
-            if progress:
-                progress("sorting", instant + 1, len(instants))
-    except KeyboardInterrupt:
-        interrupted = True
+    for instant in range(len(instants)):
+        if stop.asked:
+            break
+        step = pipeline.step(instants.detections(instant), instants.readings(instant))
+        assigned.add([*step.updates, *step.bystanders], step.estimates)
+        notes += [f"{instant / setup.rate_hz:.2f} s: {note}" for note in step.notes]
+        moved += [(instant, step)] if step.renumbered else []
+        if progress:
+            progress("sorting", instant + 1, len(instants))
     vote = SensorVote(setup.landmarks, worn_sensors(setup))
     begun: dict[int, set[str]] = {}
     for instant, step in moved:
@@ -95,7 +105,7 @@ def sort_instants(
     return Sorted(
         shapes={name: pipeline.estimator(name).shape for name in assigned.names},
         begun=begun,
-        interrupted=interrupted,
+        interrupted=stop.asked,
         notes=tuple(notes),
     )
 

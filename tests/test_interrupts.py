@@ -1,0 +1,151 @@
+"""Ctrl-C between any two lines of a solve: what is kept is whole, a second one ends it at once."""
+
+import signal
+import sys
+import threading
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fusecap
+from fusecap.batch.replay import solve_as_live
+from fusecap.batch.second_solve import recorded_inputs
+from fusecap.batch.solve import solve_instants
+from fusecap.interrupts import ctrl_c_held
+from fusecap.recording.reader import Recording
+from fusecap.solve import whole_motion
+from recorded_run import record, simulated_run
+
+SOURCE = Path(fusecap.__file__).parent
+
+
+def press() -> None:
+    signal.raise_signal(signal.SIGINT)
+
+
+def test_ctrl_c_is_asked_for_and_then_python_s_own_again():
+    with ctrl_c_held() as outer:
+        assert not outer.asked
+        with ctrl_c_held() as inner:
+            press()
+        assert inner.asked and outer.asked
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    with pytest.raises(KeyboardInterrupt):
+        press()
+
+
+def test_a_second_ctrl_c_ends_at_once():
+    with pytest.raises(KeyboardInterrupt), ctrl_c_held():
+        press()
+        press()
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_an_error_leaves_python_s_own_handler():
+    with pytest.raises(ValueError, match="x"), ctrl_c_held():
+        raise ValueError("x")
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@pytest.mark.parametrize("handler", [signal.SIG_IGN, lambda *_: None])
+def test_who_handles_ctrl_c_otherwise_goes_on_doing_so(handler):
+    signal.signal(signal.SIGINT, handler)
+    try:
+        with ctrl_c_held() as stop:
+            press()
+            assert signal.getsignal(signal.SIGINT) is handler
+        assert not stop.asked
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def test_a_thread_asks_without_a_handler_of_its_own():
+    told = []
+
+    def work():
+        with ctrl_c_held() as stop:
+            told.append(stop.asked)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert told == [False]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    path = folder / "run.mcap"
+    with path.open("wb") as file:
+        record(file, *simulated_run(folder / "session", seconds=0.3))
+    return Recording(path)
+
+
+class Pressing:
+    """Presses Ctrl-C before the n-th line that is run in these modules of `fusecap`."""
+
+    def __init__(self, modules, line):
+        self._files = {str(SOURCE / f"{module}.py") for module in modules}
+        self._line = line
+        self.lines = 0
+
+    def __enter__(self):
+        sys.settrace(self._call)
+        return self
+
+    def __exit__(self, *_):
+        sys.settrace(None)
+
+    def _call(self, frame, *_):
+        code = frame.f_code
+        ours = code.co_filename in self._files and code.co_name not in BEFORE
+        return self._each if ours else None
+
+    def _each(self, frame, event, _):
+        if event == "line":
+            self.lines += 1
+            if self.lines == self._line:
+                signal.raise_signal(signal.SIGINT)
+        return self._each
+
+
+SECOND = ("batch/second_pass", "solve/whole_motion")
+BEFORE = ("__init__", "__len__", "sort_instants")
+"""Where nothing is solved yet and nothing is kept."""
+FIRST = ("batch/sorting", "batch/assignments")
+
+
+@pytest.mark.parametrize("modules", [FIRST, SECOND], ids=["sorting", "solving"])
+def test_ctrl_c_between_any_two_lines_leaves_the_first_instants_whole(run, modules, monkeypatch):
+    monkeypatch.setattr(whole_motion, "PIECE", 4)
+    monkeypatch.setattr(whole_motion, "AHEAD", 4)
+    setup, instants = recorded_inputs(run)
+    with Pressing(modules, line=0) as whole_run:
+        whole = solve_instants(setup, instants).take
+    for line in np.linspace(1, whole_run.lines, 6).astype(int):
+        with Pressing(modules, line) as pressed:
+            solved = solve_instants(setup, instants)
+        assert solved.report.interrupted, line
+        assert pressed.lines >= line
+        take, count = solved.take, len(solved.take.timestamps_ns)
+        assert (take.timestamps_ns == whole.timestamps_ns[:count]).all()
+        known = take.tracked & whole.tracked[: len(take.tracked), :count]
+        off_m = take.theta[..., :3] - whole.theta[: len(take.theta), :count, :3]
+        assert np.abs(off_m[known]).max(initial=0.0) < 0.01, line
+    assert count > 12, "pressed near the end, most instants are there"
+
+
+def test_ctrl_c_in_a_replay_leaves_the_first_instants(run):
+    whole, _ = solve_as_live(run)
+
+    def press_once(_what, done, total, at=count()):
+        if next(at) == 20:
+            press()
+
+    solved, _ = solve_as_live(run, progress=press_once)
+    assert solved.report.interrupted
+    rows = len(solved.take.timestamps_ns)
+    assert 0 < rows < len(whole.take.timestamps_ns)
+    assert np.array_equal(solved.take.theta, whole.take.theta[:, :rows], equal_nan=True)
