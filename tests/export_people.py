@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+import pytest
 
 from fusecap.body.skeleton import PAPER21, Skeleton
 from fusecap.take import Take
 from motions import person, take_of, walk
 
+READERS = Path(__file__).parent / "readers"
 NEAR_M, NEAR_DEG = 1e-3, 0.1
 """What every reader finds lies within these of the take."""
 
@@ -43,3 +49,24 @@ def degrees_apart(one: np.ndarray, other: np.ndarray) -> float:
     """The largest angle between unit quaternions of one order (..., 4)."""
     cosine = np.abs((one * other).sum(axis=-1)).clip(0, 1)
     return float(np.degrees(2 * np.arccos(cosine)).max())
+
+
+def environment(variable: str, module: str) -> str:
+    """A Python that has `module`, in an environment of its own."""
+    python = os.environ.get(variable)
+    if not python:
+        pytest.skip(f"{variable} does not name a Python with {module}")
+    return python
+
+
+def run_reader(python: str, script: str, *arguments: object) -> dict:
+    """The last line a reader prints, as JSON."""
+    run = subprocess.run(
+        [python, str(READERS / script), *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert run.returncode == 0, run.stderr
+    return json.loads(run.stdout.splitlines()[-1])

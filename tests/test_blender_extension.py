@@ -1,8 +1,6 @@
 """The Blender extension, from its zip, in a Blender without a window."""
 
 import contextlib
-import json
-import os
 import socket
 import subprocess
 import sys
@@ -13,7 +11,7 @@ import numpy as np
 import pytest
 
 import fusecap
-from export_people import NEAR_M, two_walkers, with_gap
+from export_people import NEAR_M, environment, run_reader, two_walkers, with_gap
 from fusecap.take import save_take
 from motions import person
 from test_retarget_character import character_file, in_armature, world_of
@@ -57,26 +55,18 @@ def streaming(take: Path):
 
 @pytest.mark.slow
 def test_takes_and_streams_become_armatures_that_move_and_move_characters(tmp_path, extension):
-    python = os.environ.get("FUSECAP_BPY_PYTHON")
-    if not python:
-        pytest.skip("FUSECAP_BPY_PYTHON does not name a Python with bpy")
+    python = environment("FUSECAP_BPY_PYTHON", "bpy")
     take = with_gap(two_walkers(60, names=("anna", "Zoë/2")), [20, 21])
     save_take(take, tmp_path / "t.npz")
-    script = ROOT / "tests" / "readers" / "blender_extension.py"
     out = tmp_path / "out.npz"
     mixamo = character_file(tmp_path / "mixamo.glb", rig="mixamo", shape=person(1.9))
     plain = character_file(tmp_path / "plain.glb", rig="ue5", shape=person(1.2))
     characters = [mixamo, in_armature(plain, tmp_path / "scaled.glb")]
     with streaming(tmp_path / "t.npz") as address:
-        run = subprocess.run(
-            [python, script, extension, tmp_path / "t.npz", out, address, *characters],
-            capture_output=True,
-            text=True,
-            timeout=240,
-            check=False,
+        told = run_reader(
+            python, "blender_extension.py", extension, tmp_path / "t.npz", out, address, *characters
         )
-    assert run.returncode == 0, run.stderr
-    assert json.loads(run.stdout.splitlines()[-1])["people"] == 3
+    assert told["people"] == 3
     with np.load(out) as found:
         tracked_first = take.tracked[0]
         for row, name in enumerate(take.subject_names):

@@ -18,7 +18,16 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 import fusecap
-from export_people import NEAR_DEG, NEAR_M, degrees_apart, two_walkers, with_gap
+from export_people import (
+    NEAR_DEG,
+    NEAR_M,
+    READERS,
+    degrees_apart,
+    environment,
+    run_reader,
+    two_walkers,
+    with_gap,
+)
 from fusecap.body.landmarks import landmark_set_named
 from fusecap.body.pose import landmarks_in_world
 from fusecap.body.rigs import PRESETS
@@ -43,29 +52,7 @@ from fusecap.sources.imu_files.formats.sto import FORMAT as STO
 from fusecap.take import save_take
 from motions import person, take_of, walk
 
-READERS = Path(__file__).parent / "readers"
 ODD_NAMES = ('a,b/"c" 100%s', "Zoë 🙂")
-
-
-def environment(variable: str, module: str) -> str:
-    """A Python that has `module`, in an environment of its own."""
-    python = os.environ.get(variable)
-    if not python:
-        pytest.skip(f"{variable} does not name a Python with {module}")
-    return python
-
-
-def run_reader(python: str, script: str, *arguments: object) -> dict:
-    """The last line a reader prints, as JSON."""
-    run = subprocess.run(
-        [python, str(READERS / script), *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
-    assert run.returncode == 0, run.stderr
-    return json.loads(run.stdout.splitlines()[-1])
 
 
 @pytest.mark.parametrize("names", [("anna", "ben"), ODD_NAMES])

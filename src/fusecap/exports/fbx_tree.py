@@ -25,6 +25,8 @@ _VERSIONS = range(7000, 7500)
 _RECORD = struct.Struct("<IIIB")
 _END = b"\0" * _RECORD.size
 _SIZES = {b"C": 1, b"B": 1, b"Y": 2, b"I": 4, b"F": 4, b"D": 8, b"L": 8}
+_KINDS = {"i": "<i4", "l": "<i8", "f": "<f4", "d": "<f8"}
+_ZLIB = struct.pack("<I", 1)
 _MOST_BYTES = 1 << 32
 
 
@@ -58,6 +60,13 @@ class FbxElement:
         """A property that is a float of 64 bits."""
         return struct.unpack("<d", self.properties[index][1:])[0]
 
+    def numbers(self, index: int) -> np.ndarray:
+        """A property that is an array of int32, int64, float32 or float64."""
+        kind, packed = self.properties[index][:1].decode(), self.properties[index][13:]
+        if self.properties[index][5:9] == _ZLIB:
+            packed = zlib.decompress(packed)
+        return np.frombuffer(packed, _KINDS[kind])
+
 
 def text_property(text: bytes) -> bytes:
     """A string."""
@@ -66,9 +75,10 @@ def text_property(text: bytes) -> bytes:
 
 def array_property(values: np.ndarray) -> bytes:
     """An array of int32, int64, float32 or float64."""
-    letter = {"i4": b"i", "i8": b"l", "f4": b"f", "f8": b"d"}[values.dtype.str[1:]]
+    letter = next(letter for letter, kind in _KINDS.items() if kind == values.dtype.str)
     packed = zlib.compress(np.ascontiguousarray(values).tobytes(), 1)
-    return letter + struct.pack("<III", len(values), 1, len(packed)) + packed
+    head = struct.pack("<I", len(values)) + _ZLIB + struct.pack("<I", len(packed))
+    return letter.encode() + head + packed
 
 
 @dataclass(slots=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,12 +12,23 @@ from scipy.spatial.transform import Rotation
 from fusecap.exports.body_mesh import body_mesh
 from fusecap.exports.gltf import Gltf
 from fusecap.exports.rig_motion import RigMotion
+from fusecap.take import made_by
 
 COLOURS = (
     *((0.30, 0.55, 0.85), (0.90, 0.50, 0.25), (0.35, 0.70, 0.45), (0.80, 0.40, 0.60)),
     *((0.65, 0.60, 0.30), (0.45, 0.45, 0.80), (0.25, 0.65, 0.70), (0.75, 0.35, 0.30)),
 )
 """Of people, in order; linear light."""
+
+
+def people_at_rest(motions: Sequence[RigMotion]) -> tuple[Gltf, list[tuple[RigMotion, list[int]]]]:
+    """A document of everybody, one in the other, and everybody's nodes by joint."""
+    gltf, people = Gltf.new(made_by()), []
+    for row, motion in enumerate(motions):
+        nodes = add_joints(gltf, motion)
+        add_body(gltf, motion, nodes, COLOURS[row % len(COLOURS)])
+        people.append((motion, nodes))
+    return gltf, people
 
 
 def add_joints(gltf: Gltf, motion: RigMotion) -> list[int]:

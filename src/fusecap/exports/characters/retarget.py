@@ -22,12 +22,12 @@ from scipy.spatial.transform import Rotation
 
 from fusecap.body.rigs import PRESETS
 from fusecap.errors import InputError
-from fusecap.exports.blender import fbx_from_glb, run_in_blender
+from fusecap.exports.blender import run_in_blender
 from fusecap.exports.characters.bone_names import BoneMap, bone_map
 from fusecap.exports.characters.bone_words import spine_shares
 from fusecap.exports.characters.character import Character, read_character
+from fusecap.exports.fbx_motion import NodeMotion, write_fbx
 from fusecap.exports.gltf import Gltf
-from fusecap.exports.library import written_by_name
 from fusecap.exports.rig_motion import RigMotion, rig_motion, short_way
 from fusecap.geometry.two_bone import STRETCHED, least_turns, two_bone_turns
 from fusecap.take import Take
@@ -92,13 +92,13 @@ def retarget(
         mapped = bone_map(read, bones or {})
         motion = rig_motion(take, row, PRESETS["native"])
         placed = _Moved(read, mapped, motion)
-        glb = out if out.suffix.lower() != ".fbx" else Path(folder) / "moved.glb"
-        _write(read, placed, motion, glb)
-        if glb != out:
-            frames = len(take.timestamps_ns)
-            written_by_name(
-                out, lambda fbx: fbx_from_glb(glb, fbx, rate_hz=take.rate_hz, frames=frames)
-            )
+        if out.suffix.lower() == ".fbx":
+            tree = copy.deepcopy(read.tree)
+            tree.pop("animations", None)
+            still = Gltf(tree, read.binary)
+            write_fbx(still, placed.moves(), out, time_s=motion.time_s, rate_hz=motion.rate_hz)
+        else:
+            _write(read, placed, motion, out)
     return Retargeted(
         path=out,
         bones={bone: read.names[node] for bone, node in mapped.bones.items()}
@@ -147,6 +147,17 @@ class _Moved:
         self._hips_m[:, 1] -= self._too_high_m()
         for side in ("left", "right"):
             self._reach(side)
+
+    def moves(self) -> dict[int, NodeMotion]:
+        """Of the nodes that move, in the world."""
+        return {
+            node: NodeMotion(
+                rest=self._character.world_rotation[node],
+                turn=Rotation.from_matrix(turn),
+                place_m=self._hips_m if node == self.hips else None,
+            )
+            for node, turn in self.turns.items()
+        }
 
     def rotation_in_parent(self, node: int) -> Float[np.ndarray, "t 3 3"]:
         """Of a node that moves."""

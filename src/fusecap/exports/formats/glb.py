@@ -6,32 +6,19 @@ joints the last pose.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
-from fusecap.exports.gltf import Gltf
-from fusecap.exports.gltf_people import COLOURS, add_animation, add_body, add_joints, hide_untracked
-from fusecap.exports.rig_motion import RigMotion, rig_motions
+from fusecap.exports.gltf_people import add_animation, hide_untracked, people_at_rest
+from fusecap.exports.rig_motion import rig_motions
 from fusecap.exports.take_format import ExportOptions, TakeFormat
-from fusecap.take import Take, made_by
+from fusecap.take import Take
 
 
 def write_glb(take: Take, path: Path, options: ExportOptions) -> None:
     """Writes everybody who is tracked, whole or not at all."""
-    write_people(rig_motions(take, options.rig), path, animated=True)
-
-
-def write_people(motions: Sequence[RigMotion], path: Path, *, animated: bool) -> None:
-    """Whole or not at all; at rest, one in the other, unless they are animated."""
-    gltf = Gltf.new(made_by())
-    people = []
-    for row, motion in enumerate(motions):
-        nodes = add_joints(gltf, motion)
-        add_body(gltf, motion, nodes, COLOURS[row % len(COLOURS)])
-        people.append((motion, nodes))
-    if animated:
-        add_animation(gltf, people, "take", only_root_moves=False)
-        hide_untracked(gltf, people)
+    gltf, people = people_at_rest(rig_motions(take, options.rig))
+    add_animation(gltf, people, "take", only_root_moves=False)
+    hide_untracked(gltf, people)
     gltf.write(path)
 
 
