@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import viser
@@ -27,6 +28,7 @@ from fusecap.cli import app
 from fusecap.engine.engine import LiveStep
 from fusecap.errors import InputError, TakeError
 from fusecap.evaluate.errors_over_time import errors_over_time
+from fusecap.geometry.quaternions import from_wxyz
 from fusecap.live.status import (
     Incident,
     Light,
@@ -38,6 +40,8 @@ from fusecap.live.status import (
 )
 from fusecap.pipeline import Step
 from fusecap.setup import SessionSetup
+from fusecap.sources.session_file import parse_session
+from fusecap.sources.video import Video
 from fusecap.take import Take
 from fusecap.types import (
     CameraImage,
@@ -50,6 +54,7 @@ from fusecap.types import (
     TrackUpdate,
 )
 from fusecap.viewer import tables
+from fusecap.viewer.backdrop import HungPicture, VideoAtTimes, videos_of
 from fusecap.viewer.curves import BoneCurve
 from fusecap.viewer.figure import Figure, Pose, pose_of
 from fusecap.viewer.floor_plan import FloorDrawing, floor_plan
@@ -62,6 +67,8 @@ from fusecap.viewer.take import TakePage
 from live_fakes import BODY25, live_setup, step_of, wait_for
 from motions import person, take_of, walk
 from scenes import ring
+from session_files import write_session
+from video_files import number_of, write_video
 
 NASTY = '<img src=x onerror="document.title=1"> **b** [l](javascript:1) "\'&'
 BLUE = PEOPLE_RGB[0]
@@ -428,6 +435,54 @@ def test_view_of_a_file_that_is_not_there_is_one_line():
     assert isinstance(result.exception, TakeError) and "nowhere.npz" in str(result.exception)
 
 
+# Videos behind figures
+
+
+def test_a_frame_is_the_nearest_to_a_time_wherever_one_jumps(tmp_path: Path):
+    video = Video(write_video(tmp_path / "a.mp4", 90, rate_hz=30.0))
+    found = VideoAtTimes(video, 5.0 + np.arange(90) / 30.0)
+    assert found.at(4.9) is None and found.at(8.2) is None
+    for number in (3, 4, 4, 9, 80, 2, 89, 0):
+        frame = found.at(5.0 + number / 30.0 + 0.01)
+        assert frame is not None and frame.number == number == number_of(frame.image)
+
+
+def test_videos_are_opened_when_they_are_asked_for_and_with_words(tmp_path: Path):
+    calibrated = write_session(tmp_path, frames=2, cameras=2)
+    text = calibrated.read_text()
+    calibrated.write_text(text.replace('name = "cam0"', 'name = "cam0"\nvideo = "cam0.mp4"'))
+    (tmp_path / "cam0.mp4").write_bytes(b"no video")
+    videos = videos_of(parse_session(calibrated))
+    assert list(videos) == ["cam0"]
+    with pytest.raises(InputError, match=r"cam0\.mp4"):
+        videos["cam0"]()
+
+
+def test_a_picture_hangs_where_the_rays_of_its_pixels_go():
+    """Also with a bent lens whose middle is not the picture's, at another size than calibrated."""
+    camera = replace(
+        ring(1, distortion=(-0.2, 0.05, 0.002, -0.001, 0.0)).cameras[0],
+        matrix=np.array([[1100.0, 0, 900], [0, 1110.0, 600], [0, 0, 1]]),
+    )
+    place_m = np.array([[0.4, 1.3, -0.3]])
+    view = HungPicture(camera, place_m)
+    film = np.zeros((540, 960, 3), np.uint8)
+    cv2.circle(
+        film, tuple(np.round(camera.project(place_m)[0] / 2).astype(int)), 6, (0, 0, 255), -1
+    )
+    picture = view.picture(film)
+    rows, columns = np.nonzero(picture[..., 0] > 128)
+    height, width = picture.shape[:2]
+    share = np.array([columns.mean() + 0.5, rows.mean() + 0.5]) / [width, height] - 0.5
+    on_picture = [*(share * view.size_m), 0.0]
+    hung = view.centre_in_world_m + from_wxyz(view.wxyz).apply(on_picture)
+    centre = camera.position_in_world
+    to_person, to_picture = place_m[0] - centre, hung - centre
+    assert np.linalg.norm(to_picture) > np.linalg.norm(to_person) + 1.0
+    cosine = to_person @ to_picture / np.linalg.norm(to_person) / np.linalg.norm(to_picture)
+    assert np.degrees(np.arccos(cosine)) < 0.1
+
+
 # In a browser
 
 
@@ -471,8 +526,6 @@ def in_thread(run: Callable[[threading.Event], None]) -> Iterator[None]:
 
 
 def canvas_of(shown) -> np.ndarray:
-    import cv2
-
     clip = {"x": 0, "y": 160, "width": 500, "height": 540}
     data = np.frombuffer(shown.screenshot(clip=clip, timeout=60_000), np.uint8)
     picture = cv2.imdecode(data, cv2.IMREAD_COLOR)
@@ -481,13 +534,16 @@ def canvas_of(shown) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_a_take_is_seen_and_scrubbing_moves_it(browser):
+def test_a_take_is_seen_and_scrubbing_moves_it(browser, tmp_path: Path):
     take = take_of(np.stack([walk(person(), 120)]), [person()], names=(NASTY,))
     curves = [
         BoneCurve(title="error (mm)", time_s=take.time_s, by_person={NASTY: np.ones((120, 21))})
     ]
+    red = np.full((90, 160, 3), (0, 0, 255), np.uint8)
+    video = Video(write_video(tmp_path / "cam1.mp4", 60, picture=lambda _: red))
+    videos = {"cam1": lambda: VideoAtTimes(video, np.arange(60) / 30.0)}
     with page_of() as page:
-        shown_take = TakePage(page, take, rig=ring(3), curves=curves)
+        shown_take = TakePage(page, take, rig=ring(3), videos=videos, curves=curves)
         with in_thread(shown_take.run):
             shown, hosts = opened(browser, page)
             button = shown.get_by_role("button", name="Pause")
@@ -507,6 +563,12 @@ def test_a_take_is_seen_and_scrubbing_moves_it(browser):
             shown.get_by_role("button", name="+1 s", exact=True).click()
             shown.wait_for_timeout(1500)
             assert np.abs(canvas_of(shown) - before).max() > 60
+            shown.get_by_label("Behind the figures").first.click()
+            shown.get_by_role("option", name="cam1").click()
+            shown.wait_for_timeout(2000)
+            film = canvas_of(shown)
+            reddish = (film[..., 2] > 150) & (film[..., :2] < 120).all(axis=2)
+            assert reddish.mean() > 0.3, "no video behind the person"
             assert shown.locator("img[src='x']").count() == 0 and shown.title() != "1"
             assert hosts == {page.address.removeprefix("http://")}
 

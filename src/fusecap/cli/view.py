@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from fusecap.cli.common import Json, print_json
 from fusecap.cli.terminal import console, note, progress
+from fusecap.errors import FusecapError
 
 if TYPE_CHECKING:
     from fusecap.geometry.camera import Rig
+    from fusecap.sources.session import Session
+    from fusecap.viewer.backdrop import OpenVideo
     from fusecap.viewer.curves import BoneCurve
     from fusecap.viewer.page import Page
     from fusecap.viewer.recording import RecordedDetections
@@ -43,7 +47,11 @@ def view(
         ),
     ],
     session: Annotated[
-        Path | None, typer.Option(help="Its session.toml or folder: shows the cameras.")
+        Path | None,
+        typer.Option(
+            help="Its session.toml or folder: shows the cameras and their videos; default: the one "
+            "beside a take."
+        ),
     ] = None,
     truth: Annotated[
         Path | None, typer.Option(help="A take of the true motion: plots the errors.")
@@ -58,7 +66,9 @@ def view(
     Nothing leaves this machine. Ctrl-C ends it.
     """
     from fusecap.recording.layout import SUFFIX
+    from fusecap.sources.session import FILE_NAME
     from fusecap.stored_take import StoredTake
+    from fusecap.viewer.backdrop import videos_of
 
     detections = None
     if take.suffix == SUFFIX:
@@ -66,14 +76,23 @@ def view(
     else:
         loaded = StoredTake(take)
         loaded.check()
-    rig = None if session is None else _rig_of(session)
-    if rig is None and detections is not None:
+    rig, filmed = None, None
+    if session is not None:
+        rig, filmed = _filmed(session)
+    elif detections is not None:
         rig = detections.setup.rig
+    elif take.with_name(FILE_NAME).is_file():
+        try:
+            rig, filmed = _filmed(take.with_name(FILE_NAME))
+        except FusecapError as error:
+            note(f"without the cameras of the session beside the take: {error}")
     curves = [] if truth is None else error_curves(loaded, StoredTake(truth))
     look(
         loaded,
         f"fusecap view {take.name}",
         rig=rig,
+        # A recording has a clock of its own.
+        videos={} if filmed is None or take.suffix == SUFFIX else videos_of(filmed),
         curves=curves,
         detections=detections,
         host=host,
@@ -106,11 +125,13 @@ def error_curves(take: ViewedTake, truth: ViewedTake) -> list[BoneCurve]:
     ]
 
 
-def _rig_of(session: Path) -> Rig:
-    from fusecap.sources.session_cameras import open_rig
+def _filmed(path: Path) -> tuple[Rig, Session]:
+    """The cameras of a session, and the session with what its files say."""
+    from fusecap.sources.session_cameras import open_rig, with_detections
     from fusecap.sources.session_file import parse_session
 
-    return open_rig(parse_session(session))[0]
+    session = parse_session(path)
+    return open_rig(session)[0], with_detections(session)
 
 
 def look(
@@ -118,6 +139,7 @@ def look(
     title: str,
     *,
     rig: Rig | None,
+    videos: Mapping[str, OpenVideo] = MappingProxyType({}),
     curves: Sequence[BoneCurve],
     detections: RecordedDetections | None = None,
     host: str = "127.0.0.1",
@@ -132,7 +154,9 @@ def look(
     page = Page(title, host=host, port=port)
     with suppress(KeyboardInterrupt):
         try:
-            shown = TakePage(page, take, rig=rig, curves=curves, detections=detections)
+            shown = TakePage(
+                page, take, rig=rig, videos=videos, curves=curves, detections=detections
+            )
             _announce(page, browser=browser, as_json=as_json)
             shown.run()
         finally:

@@ -24,6 +24,8 @@ _FOV_RAD = 0.8
 _MIN_RADIUS_M = 1.3
 """Of what fills the picture."""
 _EYE_HEIGHT_M = 0.95
+_LOOKED_AT_M = 4.0
+"""From a camera to the place about which its view is turned."""
 _NEW_SHAPE = 0.03
 """Change of a picture's shape from which it is framed anew."""
 
@@ -35,7 +37,8 @@ class Room:
         self, page: viser.ViserServer, rig: Rig | None, *, frustum_m: float = 0.28
     ) -> None:
         self._page = page
-        self._looked = np.zeros((1, 3)), "corner"
+        self._looked: tuple[Float[np.ndarray, "n 3"], str] | Camera = np.zeros((1, 3)), "corner"
+        self._cameras_shown = True
         page.on_client_connect(self._welcome)
         page.scene.add_grid(
             "/floor",
@@ -64,14 +67,20 @@ class Room:
 
     def show_cameras(self, visible: bool) -> None:
         """Or hide them, with their names."""
-        for frustum in self.frusta.values():
-            frustum.visible = visible
+        self._cameras_shown = visible
+        self._show_frusta()
 
     def look(self, at: Float[np.ndarray, "n 3"], view: str = "corner") -> None:
         """Whoever is there or comes sees these places on the floor, and people who stand there."""
         self._looked = at, view
-        for client in self._page.get_clients().values():
-            self._turn(client)
+        self._show_frusta()
+        self._turn_all()
+
+    def look_through(self, camera: Camera) -> None:
+        """Whoever is there or comes sees what the camera sees, all of it."""
+        self._looked = camera
+        self._show_frusta()
+        self._turn_all()
 
     def _welcome(self, client: viser.ClientHandle) -> None:
         """The picture takes its final shape only after the first look, when the panel is there."""
@@ -84,13 +93,26 @@ class Room:
                 seen = camera.aspect
                 self._turn(client)
 
+    def _show_frusta(self) -> None:
+        through = self._looked.name if isinstance(self._looked, Camera) else None
+        for name, frustum in self.frusta.items():
+            frustum.visible = self._cameras_shown and name != through
+
+    def _turn_all(self) -> None:
+        for client in self._page.get_clients().values():
+            self._turn(client)
+
     def _turn(self, client: viser.ClientHandle) -> None:
+        if isinstance(self._looked, Camera):
+            _place(client, self._looked)
+            return
         at, view = self._looked
         centre, radius_m = _framed(at)
         half_rad = min(_FOV_RAD, 2 * np.arctan(np.tan(_FOV_RAD / 2) * client.camera.aspect)) / 2
         direction = np.array(_DIRECTIONS[view])
         eye = centre + radius_m / np.sin(half_rad) * direction / np.linalg.norm(direction)
         with client.atomic():
+            client.camera.up_direction = (0.0, 1.0, 0.0)
             client.camera.fov = _FOV_RAD
             client.camera.position, client.camera.look_at = eye, centre
 
@@ -121,6 +143,18 @@ def _framed(at: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "3"], float
     centre = np.array([(low[0] + high[0]) / 2, _EYE_HEIGHT_M, (low[2] + high[2]) / 2])
     radius_m = max(_MIN_RADIUS_M, 0.8 + float(np.hypot(*(high - low)[[0, 2]])) / 2)
     return centre, radius_m
+
+
+def _place(client: viser.ClientHandle, camera: Camera) -> None:
+    """Where the camera is, as wide as its picture needs in the client's window."""
+    size, middle = np.array(camera.size_px), camera.matrix[:2, 2]
+    reach = np.maximum(middle, size - middle) / camera.matrix[[0, 1], [0, 1]]
+    half = max(reach[1], reach[0] / client.camera.aspect)
+    with client.atomic():
+        client.camera.up_direction = -camera.rotation[1]
+        client.camera.fov = float(2 * np.arctan(half))
+        client.camera.position = camera.position_in_world
+        client.camera.look_at = camera.position_in_world + _LOOKED_AT_M * camera.rotation[2]
 
 
 def _frustum(page: viser.ViserServer, camera: Camera, size_m: float) -> viser.CameraFrustumHandle:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -18,6 +19,7 @@ from fusecap.errors import TakeError
 from fusecap.exports.stick_figures import passing
 from fusecap.geometry.camera import Rig
 from fusecap.take import Take
+from fusecap.viewer.backdrop import RATE_HZ, Backdrop, OpenVideo
 from fusecap.viewer.controls import PlaybackControls
 from fusecap.viewer.curves import ALL_BONES, BoneCurve, Plot, drawn, sigma_curve
 from fusecap.viewer.figure import Pose
@@ -66,9 +68,11 @@ class TakePage:
         take: ViewedTake,
         *,
         rig: Rig | None = None,
+        videos: Mapping[str, OpenVideo] = MappingProxyType({}),
         curves: Sequence[BoneCurve] = (),
         detections: RecordedDetections | None = None,
     ) -> None:
+        """`rig`: its cameras are shown, and their `videos`, by camera, behind the figures."""
         if len(take.timestamps_ns) == 0:
             raise TakeError("the take has no frame: nothing to view; solve it again")
         self._page = page
@@ -91,6 +95,10 @@ class TakePage:
         stay = ~passing(take.tracked)
         everywhere = places_of(list(seen.bone_position_in_world_m[stay, :, 0]))
         add_view_controls(page, room, lambda: everywhere)
+        self._backdrop = None
+        if rig is not None and videos:
+            nearby = places_of(list(seen.bone_position_in_world_m[:, :, 0]))
+            self._backdrop = Backdrop(page, room, videos, rig, nearby, self._controls.nudge)
         self._views = detections and detections.views(page.gui, colours)
         self._plots = self._add_plots([sigma_curve(seen, take.time_s[frames]), *curves], colours)
         self._drawn: tuple[int, tuple[bool, ...]] | None = None
@@ -103,7 +111,9 @@ class TakePage:
         last_s = time.monotonic()
         plotted_s = 0.0
         while not stopping.is_set():
-            controls.wait(1 / _UPDATES_HZ if controls.playing else _IDLE_S)
+            with_video = self._backdrop is not None and self._backdrop.shown
+            updates_hz = RATE_HZ if with_video else _UPDATES_HZ
+            controls.wait(1 / updates_hz if controls.playing else _IDLE_S)
             now_s = time.monotonic()
             frame, position_s = controls.advance(now_s - last_s)
             last_s = now_s
@@ -113,6 +123,9 @@ class TakePage:
                 self._draw(frame, position_s, plots=plots)
 
     def _draw(self, frame: int, position_s: float, *, plots: bool) -> None:
+        if self._backdrop is not None:
+            exposed_ns = self._backdrop.at(int(self._take.timestamps_ns[frame]))
+            frame = int(np.abs(self._take.timestamps_ns - exposed_ns).argmin())
         shown = tuple(box.value for box in self._boxes)
         moved = (frame, shown) != self._drawn
         poses = self._poses(frame) if moved or plots else {}
