@@ -27,9 +27,11 @@ from mcap.writer import Writer
 
 from fusecap.body.landmarks import LANDMARK_SETS, LandmarkOffsets
 from fusecap.errors import InputError
+from fusecap.kernels.records import COLUMNS, find_records
 from fusecap.live.devices.source import SessionClock
 from fusecap.live.recorder import Recorder
 from fusecap.recording import reader
+from fusecap.recording.index import RecordingIndex
 from fusecap.recording.reader import RecordedEvent, RecordedPose, Recording
 from fusecap.recording.setup_json import setup_from_values, setup_values
 from fusecap.recording.writer import RecordingWriter
@@ -669,3 +671,53 @@ def test_a_killed_run_loses_at_most_its_last_second(tmp_path, rng):
             for _ in StreamReader(file).records:
                 found += 1
     assert found > len(back)
+
+
+def records_by_hand(data: bytes) -> list[tuple[int, ...]]:
+    """As `find_records` has them, by struct."""
+    found, at = [], 0
+    while at + 9 <= len(data):
+        opcode, length = struct.unpack_from("<BQ", data, at)
+        at += 9
+        if length > len(data) - at or (opcode == 5 and length < 22):
+            break
+        told = struct.unpack_from("<HIQQ", data, at) if opcode == 5 else (0, 0, 0, 0)
+        found.append((opcode, at, at + length, *told))
+        at += length
+    return found
+
+
+@given(
+    records=st.lists(
+        st.tuples(
+            st.sampled_from([3, 4, 5, 5, 5, 7]),
+            st.binary(max_size=60),
+            st.sampled_from([0, 0, 0, 0, 1, -1, 1 << 63]),
+        )
+    ),
+    tail=st.binary(max_size=30),
+)
+def test_records_are_found_as_struct_finds_them(records, tail):
+    data = b"".join(
+        struct.pack("<BQ", opcode, max(len(content) + off, 0)) + content
+        for opcode, content, off in records
+    )
+    data = np.frombuffer(data + tail, np.uint8)
+    rows = np.zeros((100, COLUMNS), np.int64)
+    count = find_records(data, 5, 22, rows)
+    expected = np.array(records_by_hand(bytes(data)), np.uint64).reshape(-1, COLUMNS)
+    assert count == len(expected)
+    assert (rows[:count].view(np.uint64) == expected).all() and not rows[count:].any()
+
+
+def test_times_beyond_any_clock_are_survived(whole, tmp_path):
+    packed = message("fusecap.Pose", {"name": "anna"}, 1)
+    data = zstandard.decompress(packed[9 + 32 + 4 + 8 :], 1000)
+    late = data.replace(struct.pack("<HIQQ", 1, 1, 0, 0), struct.pack("<HIQQ", 1, 1, 0, 2**64 - 1))
+    assert late != data
+    path = tmp_path / "late.mcap"
+    packed = chunk_record(zstandard.compress(late), len(late), zlib.crc32(late))
+    path.write_bytes(header_of(whole) + packed)
+    index = RecordingIndex(Recording(path))
+    (places,) = index.poses.values()
+    assert index.read(places, 0) is None

@@ -143,7 +143,18 @@ def test_head_points_follow_the_rule():
     assert np.allclose(points[MID_HIP], (points[2] + points[3]) / 2)
 
 
-@pytest.mark.parametrize("content", ["", "14 3\n", "15 2\n1\n0\n1 2 3", "hello"])
+@pytest.mark.parametrize(
+    "content",
+    [
+        "",
+        "14 3\n",
+        "15 2\n1\n0\n1 2 3",
+        "hello",
+        "15 -1",
+        "15 1\n1\n-1" + " 1" * 60,
+        "15 1\n1\n9999999",
+    ],
+)
 def test_other_text_is_no_truth(tmp_path, content):
     (tmp_path / "gt.txt").write_text(content)
     with pytest.raises(InputError, match=r"gt\.txt"):

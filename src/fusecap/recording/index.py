@@ -6,13 +6,16 @@ One pass over the file, in which no message is read but bodies; 40 bytes are kep
 from __future__ import annotations
 
 from array import array
-from contextlib import suppress
+from collections.abc import Sequence
 from functools import lru_cache
+
+import numpy as np
+from jaxtyping import Int
 
 from fusecap.body.shape import BodyShape
 from fusecap.progress import Progress
 from fusecap.recording.layout import BODY, EVENTS, KEYPOINTS, POSE, RecordedBody
-from fusecap.recording.reader import Entry, EventNumbers, Item, Recording
+from fusecap.recording.reader import Entry, EventNumbers, Item, Messages, Recording
 
 _RECORDS_KEPT = 8
 """Unpacked; a run closes one twice a second."""
@@ -28,13 +31,16 @@ class Places:
         self.numbers = array("q")
         self._records, self._starts, self._lengths = array("q"), array("q"), array("q")
 
-    def add(self, entry: Entry, time_ns: int) -> None:
-        """The next one."""
-        self.times_ns.append(time_ns)
-        self.numbers.append(entry.sequence)
-        self._records.append(entry.record_at)
-        self._starts.append(entry.start)
-        self._lengths.append(len(entry.content))
+    def add(
+        self, some: Messages, rows: Int[np.ndarray, " n"], times_ns: Int[np.ndarray, " n"]
+    ) -> None:
+        """The next ones, at these times."""
+        lengths = some.end[rows] - some.start[rows]
+        self.times_ns.frombytes(times_ns.tobytes())
+        self.numbers.frombytes(some.sequence[rows].tobytes())
+        self._records.frombytes(np.full(len(rows), some.record_at).tobytes())
+        self._starts.frombytes(some.start[rows].tobytes())
+        self._lengths.frombytes(lengths.tobytes())
 
     def at(self, row: int) -> tuple[int, int, int]:
         """Of which record, from where in it, how many bytes."""
@@ -57,23 +63,32 @@ class RecordingIndex:
         self._recording = recording
         self._unpacked = lru_cache(_RECORDS_KEPT)(recording.unpacked)
         numbers = EventNumbers()
-        for entry in recording.entries(progress, numbers):
-            time_ns = entry.publish_ns - recording.unix_minus_session_ns
-            if entry.schema in EVENTS:
-                with suppress(ValueError):
-                    numbers.take(entry.sequence)
-            if entry.schema == POSE:
-                name = entry.topic.removeprefix("/pose/")
-                self.poses.setdefault(name, Places(POSE)).add(entry, time_ns)
-            elif entry.schema == BODY:
-                body = recording.read(entry)
-                if isinstance(body, RecordedBody):
-                    self.bodies[body.name] = body.shape
-            elif entry.schema == KEYPOINTS and keypoints_hz:
-                places = self.keypoints.setdefault(entry.topic, Places(KEYPOINTS))
-                if not places.times_ns or time_ns - places.times_ns[-1] >= 1e9 / keypoints_hz:
-                    places.add(entry, time_ns)
+        for some in recording.messages(progress, numbers):
+            self._add(some, numbers, keypoints_hz)
         recording.loss.missing_events = numbers.missing
+
+    def _add(self, some: Messages, numbers: EventNumbers, keypoints_hz: float) -> None:
+        channels, first, which = np.unique(some.channel, return_index=True, return_inverse=True)
+        names = [some.names.get(channel, ("", "")) for channel in channels.tolist()]
+        is_event = np.array([schema in EVENTS for schema, _ in names], dtype=bool)
+        numbers.take_all(some.sequence[is_event[which]])
+        for index in np.argsort(first).tolist():
+            schema, topic = names[index]
+            if schema not in (POSE, BODY, KEYPOINTS):
+                continue
+            rows = np.flatnonzero(which == index)
+            times_ns = some.publish_ns[rows] - self._recording.unix_minus_session_ns
+            if schema == POSE:
+                name = topic.removeprefix("/pose/")
+                self.poses.setdefault(name, Places(POSE)).add(some, rows, times_ns)
+            elif schema == BODY:
+                for body in map(self._recording.read, map(some.entry, rows.tolist())):
+                    if isinstance(body, RecordedBody):
+                        self.bodies[body.name] = body.shape
+            elif keypoints_hz:
+                places = self.keypoints.setdefault(topic, Places(KEYPOINTS))
+                kept = _apart(times_ns, 1e9 / keypoints_hz, places.times_ns[-1:])
+                places.add(some, rows[kept], times_ns[kept])
 
     def read(self, places: Places, row: int) -> Item | None:
         """A message; None for one that is malformed, or no longer there."""
@@ -91,3 +106,13 @@ class RecordingIndex:
                 content=data[start : start + length],
             )
         )
+
+
+def _apart(times_ns: Int[np.ndarray, " n"], period_ns: float, last: Sequence[int]) -> list[int]:
+    """Rows, each a period after the one before and the first after the `last` there was."""
+    kept, before_ns = [], last[0] if last else None
+    for row, time_ns in enumerate(times_ns.tolist()):
+        if before_ns is None or time_ns - before_ns >= period_ns:
+            kept.append(row)
+            before_ns = time_ns
+    return kept

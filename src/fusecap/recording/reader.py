@@ -14,6 +14,7 @@ import json
 import struct
 import zlib
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from io import BufferedReader, BytesIO
 from pathlib import Path
@@ -21,7 +22,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 import zstandard
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -29,6 +30,7 @@ from mcap.records import Channel, Chunk, Metadata, Schema
 
 from fusecap.errors import InputError, MotionError
 from fusecap.inputs import RECORDING, open_input
+from fusecap.kernels.records import COLUMNS, find_records
 from fusecap.progress import Progress
 from fusecap.recording.layout import DECODERS, END, FORMAT, HEADER, Known, RecordedBody
 from fusecap.types import Event
@@ -40,6 +42,7 @@ MAX_RATIO = 100
 _MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")
 _BETWEEN = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA)
+_TOLD = (*_BETWEEN, Opcode.MESSAGE, Opcode.CHUNK)
 _NAME = 1000
 """Of a schema or a channel: so much is kept."""
 _MESSAGE = struct.Struct("<HIQQ")
@@ -71,6 +74,39 @@ class Entry:
     start: int
     """Of its content, in what the record unpacks to."""
     content: memoryview
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Messages:
+    """Some that follow each other, unread."""
+
+    names: Mapping[int, tuple[str, str]]
+    """Schema and topic by channel; a channel without them means nothing."""
+    record_at: int
+    data: memoryview
+    """What the record unpacks to."""
+    channel: Int[np.ndarray, " n"]
+    sequence: Int[np.ndarray, " n"]
+    log_ns: Int[np.ndarray, " n"]
+    publish_ns: Int[np.ndarray, " n"]
+    start: Int[np.ndarray, " n"]
+    """Of the content, in `data`."""
+    end: Int[np.ndarray, " n"]
+
+    def entry(self, row: int) -> Entry:
+        """One of them."""
+        schema, topic = self.names.get(int(self.channel[row]), ("", ""))
+        start = int(self.start[row])
+        return Entry(
+            schema=schema,
+            topic=topic,
+            sequence=int(self.sequence[row]),
+            log_ns=int(self.log_ns[row]),
+            publish_ns=int(self.publish_ns[row]),
+            record_at=self.record_at,
+            start=start,
+            content=self.data[start : int(self.end[row])],
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -140,7 +176,7 @@ class Recording:
             self.made_by = header["made_by"]
             self.from_start = header["from_start"] == "true"
             """Whether it holds the run from its first event."""
-            self.unix_minus_session_ns = int(header["unix_minus_session_ns"])
+            self.unix_minus_session_ns = int(np.int64(int(header["unix_minus_session_ns"])))
             if zlib.crc32(header["setup"].encode()) != int(header["setup_crc32"]):
                 raise ValueError("what the run knew fails its checksum")
             self.setup: Mapping[str, Any] = json.loads(header["setup"])
@@ -161,7 +197,15 @@ class Recording:
     def entries(
         self, progress: Progress | None = None, numbers: EventNumbers | None = None
     ) -> Iterator[Entry]:
-        """Every message, unread; `loss` counts what is not there.
+        """Every message, unread; `loss` counts what is not there. Fails as `messages`."""
+        for some in self.messages(progress, numbers):
+            for row in range(len(some.start)):
+                yield some.entry(row)
+
+    def messages(
+        self, progress: Progress | None = None, numbers: EventNumbers | None = None
+    ) -> Iterator[Messages]:
+        """All of them, some at a time; `loss` counts what is not there.
 
         Raises `InputError` for a file that unpacks to `MAX_RATIO` times its size.
         """
@@ -171,6 +215,8 @@ class Recording:
         unpacked = 0
         with self._opened() as file:
             for record_at, opcode, payload in self._records(file, loss, progress):
+                if opcode not in _TOLD:
+                    continue
                 try:
                     data = unpacked_record(opcode, payload)
                     unpacked += len(data)
@@ -179,11 +225,7 @@ class Recording:
                             f"{self.path}: unpacks to more than {most} bytes, {MAX_RATIO} times "
                             "its size; no run leaves such a recording"
                         )
-                    for kind, at, end in _spans(opcode, data):
-                        if kind == Opcode.MESSAGE:
-                            yield said.entry(data, at, end, record_at)
-                        elif kind in _BETWEEN:
-                            said.hear(kind, data[at:end])
+                    yield from _messages_in(record_at, data, said)
                 except (*_BROKEN, zstandard.ZstdError, MemoryError):
                     loss.broken_chunks += 1
         loss.note = said.note
@@ -280,7 +322,8 @@ class _Said:
         self.note = ""
         self.events = 0
         self._schemas: dict[int, str] = {}
-        self._channels: dict[int, tuple[str, str]] = {}
+        self.channels: dict[int, tuple[str, str]] = {}
+        """Schema and topic of each, so far."""
 
     def hear(self, opcode: int, content: memoryview) -> None:
         stream = ReadDataStream(BytesIO(content))
@@ -290,7 +333,7 @@ class _Said:
         elif opcode == Opcode.CHANNEL:
             channel = Channel.read(stream)
             found = self._schemas.get(channel.schema_id, ""), channel.topic[:_NAME]
-            self._channels[channel.id] = found
+            self.channels[channel.id] = found
         elif opcode == Opcode.METADATA:
             end = Metadata.read(stream)
             if end.name == END:
@@ -298,20 +341,6 @@ class _Said:
                 events = end.metadata.get("events", "")
                 if events.isdecimal() and len(events) < 19:
                     self.events = int(events)
-
-    def entry(self, data: memoryview, at: int, end: int, record_at: int) -> Entry:
-        channel, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(data[at:end])
-        schema, topic = self._channels.get(channel, ("", ""))
-        return Entry(
-            schema=schema,
-            topic=topic,
-            sequence=sequence,
-            log_ns=log_ns,
-            publish_ns=publish_ns,
-            record_at=record_at,
-            start=at + _MESSAGE.size,
-            content=data[at + _MESSAGE.size : end],
-        )
 
 
 class EventNumbers:
@@ -330,6 +359,17 @@ class EventNumbers:
         self._last += ahead
         self._count += 1
 
+    def take_all(self, numbers: Int[np.ndarray, " n"]) -> None:
+        """Those that have come, in their order; one that is not after the last is left out."""
+        ahead = np.diff(numbers, prepend=self._last) & 0xFFFFFFFF
+        if ((ahead > 0) & (ahead < 0x80000000)).all():
+            self._last += int(ahead.sum())
+            self._count += len(ahead)
+            return
+        for number in numbers.tolist():
+            with suppress(ValueError):
+                self.take(number)
+
     def state(self, count: int) -> None:
         """So many events were recorded in all."""
         self._stated = count
@@ -340,24 +380,34 @@ class EventNumbers:
         return max(self._last, self._stated) - self._count
 
 
-def _spans(opcode: int, data: memoryview) -> Iterator[tuple[int, int, int]]:
-    """Opcode, first and last place of the records of an unpacked chunk, or of a record itself."""
-    if opcode != Opcode.CHUNK:
-        yield opcode, 0, len(data)
-        return
-    at = 0
-    while at < len(data):
-        kind, length = _RECORD.unpack_from(data, at)
-        at += _RECORD.size + length
-        if at > len(data):
-            raise ValueError("a record longer than its chunk")
-        yield kind, at - length, at
+def _messages_in(record_at: int, data: memoryview, said: _Said) -> Iterator[Messages]:
+    """Those of one record, after `said` has heard it; raises `ValueError` after what is whole."""
+    content = np.frombuffer(data, np.uint8)
+    none = np.empty((0, COLUMNS), np.int64)
+    rows = np.zeros((find_records(content, Opcode.MESSAGE, _MESSAGE.size, none), COLUMNS), np.int64)
+    find_records(content, Opcode.MESSAGE, _MESSAGE.size, rows)
+    for opcode, start, end in rows[np.isin(rows[:, 0], _BETWEEN), :3].tolist():
+        said.hear(opcode, data[start:end])
+    _, start, end, channel, sequence, log_ns, publish_ns = rows[rows[:, 0] == Opcode.MESSAGE].T
+    yield Messages(
+        names=said.channels,
+        record_at=record_at,
+        data=data,
+        channel=channel,
+        sequence=sequence,
+        log_ns=log_ns,
+        publish_ns=publish_ns,
+        start=start + _MESSAGE.size,
+        end=end,
+    )
+    if len(data) != (rows[-1, 2] if len(rows) else 0):
+        raise ValueError("a record longer than its chunk")
 
 
 def unpacked_record(opcode: int, content: bytes) -> memoryview:
-    """What a chunk holds, or the record itself."""
+    """Records one after the other: those that a chunk holds, or the record itself."""
     if opcode != Opcode.CHUNK:
-        return memoryview(content)
+        return memoryview(_RECORD.pack(opcode, len(content)) + content)
     chunk = Chunk.read(ReadDataStream(BytesIO(content)))
     size = chunk.uncompressed_size
     data = chunk.data

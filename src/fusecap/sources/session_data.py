@@ -43,6 +43,7 @@ from fusecap.sources.session_sensors import (
 from fusecap.sources.sync_files import Clock, Clocks, read_sync
 from fusecap.sources.synchronizer import (
     MAX_GAP_S,
+    MountedImu,
     detections_of,
     resample_imus,
     seen_at,
@@ -59,25 +60,30 @@ HASHED_BYTES = 1 << 20
 """Of a larger file only name and size enter the hash."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+BLOCK = 256
+"""Instants that sensors are brought to at once: 3 MB of thirteen, where hours would be 2 GB."""
+
+
 class SubjectImus:
     """The sensors of one subject, on the solve's instants."""
 
-    subject: str
-    bones: tuple[str, ...]
-    """(I,) which bone carries each sensor."""
-    positions_in_bone_m: np.ndarray
-    """(I, 3) t_ib [1, eq. 11]."""
-    bone_rotation_in_world: np.ndarray
-    """(T, I, 3, 3), NaN where not measured [1, eq. 8]."""
-    accel_in_world_m_s2: np.ndarray
-    """(T, I, 3) without gravity, NaN where not measured [1, eq. 12]."""
+    def __init__(self, subject: str, imus: Sequence[MountedImu], times_s: np.ndarray) -> None:
+        self.subject = subject
+        self._imus = imus
+        self._times_s = times_s
+        self._block = -1
+        self._rotations, self._accelerations = resample_imus(imus, times_s[:0])
 
     def reading(self, instant: int) -> ImuReading:
         """What the sensors say at one of the solve's instants."""
+        block, row = divmod(instant, BLOCK)
+        if block != self._block:
+            times_s = self._times_s[block * BLOCK : (block + 1) * BLOCK]
+            self._rotations, self._accelerations = resample_imus(self._imus, times_s)
+            self._block = block
         return ImuReading(
-            bone_rotation_in_world=self.bone_rotation_in_world[instant],
-            accel_in_world_m_s2=self.accel_in_world_m_s2[instant],
+            bone_rotation_in_world=self._rotations[row],
+            accel_in_world_m_s2=self._accelerations[row],
         )
 
 
@@ -218,17 +224,7 @@ def open_session(session: Session, progress: Progress | None = None) -> SessionD
     for subject in inputs.session.subjects:
         if subject.imus:
             tracks = [track for track in inputs.imus[subject.name] if track is not None]
-            mounted = mount(subject, tracks)
-            rotations, accelerations = resample_imus(mounted, inputs.times_s)
-            imus.append(
-                SubjectImus(
-                    subject=subject.name,
-                    bones=tuple(imu.bone for imu in mounted),
-                    positions_in_bone_m=np.array([imu.position_in_bone_m for imu in mounted]),
-                    bone_rotation_in_world=rotations,
-                    accel_in_world_m_s2=accelerations,
-                )
-            )
+            imus.append(SubjectImus(subject.name, mount(subject, tracks), inputs.times_s))
     return SessionData(
         session=inputs.session,
         rig=inputs.rig,

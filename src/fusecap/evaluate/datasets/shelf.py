@@ -31,6 +31,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from fusecap.believable import MOST_PEOPLE
 from fusecap.body.landmarks import LANDMARKS, landmark_set_named
 from fusecap.errors import InputError
 from fusecap.evaluate.datasets.files import camera_at_centre, floats, text_of, unpacked
@@ -189,10 +190,12 @@ def load_truth(path: Path | str) -> ShelfTruth:
         if joints != 15:
             raise InputError(f"{path}: {joints} joints, expected Shelf's 15")
         people: list[dict[int, np.ndarray]] = []
-        for _ in range(frames):
+        for _ in range(_natural(frames)):
             people.append({})
-            for _ in range(int(next(values))):
-                actor = int(next(values))
+            for _ in range(_natural(int(next(values)))):
+                actor = _natural(int(next(values)))
+                if actor >= MOST_PEOPLE:
+                    raise InputError(f"{path}: actor {actor}, expected under {MOST_PEOPLE}")
                 rows = np.array([next(values) for _ in range(4 * joints)]).reshape(4, joints)
                 people[-1][actor] = np.where(rows[3, :, None] > 0, rows[:3].T, np.nan)
     except (StopIteration, ValueError, OverflowError) as error:
@@ -203,6 +206,12 @@ def load_truth(path: Path | str) -> ShelfTruth:
         for actor, rows in actors.items():
             points[actor, frame] = rows @ Y_UP_FROM_Z_UP.T
     return ShelfTruth(points_in_world_m=points)
+
+
+def _natural(number: int) -> int:
+    if number < 0:
+        raise ValueError(f"{number} of something")
+    return number
 
 
 def read_actors(path: Path) -> ShelfTruth:
