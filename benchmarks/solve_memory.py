@@ -2,8 +2,8 @@
 
     uv run --frozen python benchmarks/solve_memory.py --minutes 2 8 30
 
-The demo's two people with 13 sensors each in four cameras, simulated, to and fro for so many minutes; prints peak memory
-(Linux), seconds and how many times real time.
+The demo's two people with 13 sensors each in four cameras, simulated, to and fro for so many
+minutes; prints peak memory (Linux), seconds and how many times real time.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ SECONDS, RATE_HZ = 10.0, 60
 
 
 def lengthen(folder: Path, minutes: float) -> None:
-    """More frames of every camera, as links, and samples of every sensor: backwards, forwards, ..."""
+    """More frames, as links, and samples of every sensor: backwards, forwards, ..."""
     for file in sorted((folder / "imus").glob("*.csv")):
         head, *rows = file.read_text().splitlines()
         cells = [row.split(",", 1) for row in rows]
