@@ -47,7 +47,9 @@ def there_and_back(theta: np.ndarray, frames: int) -> np.ndarray:
 
 
 @cache
-def capture(seconds: float, *, synchronous: bool = False, imus: bool = True) -> Simulation:
+def capture(
+    seconds: float, *, synchronous: bool = False, imus: bool = True, seed: int = 0
+) -> Simulation:
     """Two subjects with 13 sensors each and a bystander before four cameras."""
     motion = load_demo_motion()
     frames = round(seconds * motion.rate_hz)
@@ -64,7 +66,7 @@ def capture(seconds: float, *, synchronous: bool = False, imus: bool = True) -> 
         )
         for index, (name, height_m) in enumerate(heights.items())
     ]
-    return _captured(people, motion.rate_hz, None if synchronous else TIMING)
+    return _captured(people, motion.rate_hz, None if synchronous else TIMING, seed)
 
 
 def standing(seconds: float, *, x_m: float = 0.0, facing_rad: float = 0.0) -> Simulation:
@@ -76,14 +78,14 @@ def standing(seconds: float, *, x_m: float = 0.0, facing_rad: float = 0.0) -> Si
 
 
 def _captured(
-    people: list[Person], rate_hz: float, timing: tuple[CameraTiming, ...] | None
+    people: list[Person], rate_hz: float, timing: tuple[CameraTiming, ...] | None, seed: int = 0
 ) -> Simulation:
     return simulate(
         people,
         camera_ring(4, radius_m=5.0),
         landmark_set_named("body25"),
         rate_hz=rate_hz,
-        seed=0,
+        seed=seed,
         name="live",
         volume_m=VOLUME_M,
         timing=timing,

@@ -8,6 +8,7 @@ from fusecap.body.skeleton import PAPER21
 from fusecap.evaluate.demo_scene import demo_scene
 from fusecap.geometry.triangulation import triangulate
 from fusecap.solve.estimator import Estimator, SubjectModel
+from fusecap.solve.options import SolverOptions
 from fusecap.types import Observation
 
 LATER_NS = 10**12
@@ -18,22 +19,26 @@ def simulation():
     return demo_scene(seconds=0.5)
 
 
-def estimator(simulation):
+def estimator(simulation, **options):
     person = simulation.subjects[0]
     return Estimator(
         SubjectModel(name=person.name, shape=person.shape),
         rig=simulation.rig,
         landmarks=simulation.landmark_set,
         prior=load_prior(PAPER21),
+        options=SolverOptions(**options),
     )
 
 
-def follow(estimator, simulation, instant, at_ns):
+def follow(estimator, simulation, instant, at_ns, cameras=slice(None)):
     """The pose from what was seen at an instant, as if it had been seen at `at_ns`."""
     keypoints = np.zeros((len(simulation.rig), 25, 3))
     for camera, whose in enumerate(simulation.detected_person[instant]):
         for person in np.flatnonzero(whose == 0):
             keypoints[camera] = simulation.detections[instant].people[camera][person]
+    kept = np.zeros_like(keypoints)
+    kept[cameras] = keypoints[cameras]
+    keypoints = kept
     points, _ = triangulate(simulation.rig, keypoints)
     return estimator.follow(0, Observation(timestamp_ns=at_ns, keypoints=keypoints), points)
 
@@ -64,3 +69,16 @@ def test_up_to_a_second_away_the_last_pose_is_where_the_solve_starts(simulation)
     theirs = follow(fresh, simulation, 25, back_ns)
     assert ours.theta.tobytes() != theirs.theta.tobytes()
     assert not np.array_equal(returned.predict(back_ns + 50_000_000), fresh.predict(back_ns))
+
+
+@pytest.mark.parametrize(("cameras", "alone"), [(2, False), (3, True)])
+def test_poses_that_few_cameras_see_are_not_found_alone_for_a_take(simulation, cameras, alone):
+    first_pass = estimator(simulation, seeding=True, window=4)
+    instants = estimator(simulation, window=1)
+    for instant in range(6):
+        at_ns = LATER_NS + instant * 16_666_667
+        ours, theirs = (
+            follow(one, simulation, instant, at_ns, slice(cameras))
+            for one in (first_pass, instants)
+        )
+    assert np.array_equal(ours.theta, theirs.theta) == alone

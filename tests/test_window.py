@@ -394,6 +394,22 @@ def test_sensors_alone_drift_less_where_feet_stand():
     assert drift[1] < 0.5 * drift[0]
 
 
+def test_poses_ahead_that_went_astray_do_not_keep_each_other_there(rng):
+    truth = walk(14)
+    seen = observations(truth, sites=ImuSites.none())
+    window = WindowSolver(solver(sites=ImuSites.none()), 8, ahead=6)
+    for one, pose in zip(seen[:8], truth, strict=False):
+        window.push(one, pose)
+    coming = [replace(one, keypoints=0.0 * one.keypoints) for one in seen[8:]]
+    held = window.pose()
+    astray = held + rng.normal(scale=1.5, size=held.shape)
+    away_mm = pose_error_mm_deg(SHAPE, held, truth[-1])[0]
+    for start in (held, astray):
+        found = window.ahead([(one, start) for one in coming], 3)
+        assert pose_error_mm_deg(SHAPE, found.theta[-1], truth[-1])[0] < 0.6 * away_mm
+    np.testing.assert_array_equal(window.pose(), held)
+
+
 def test_a_gap_ends_a_motion_and_begins_another(rng):
     truth, pose_solver = walk(40), solver()
     seen = observations(truth, noise_px=4.0, rng=rng)

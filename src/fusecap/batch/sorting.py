@@ -21,8 +21,8 @@ from fusecap.setup import Setup
 from fusecap.types import Detections, ImuReading
 
 SEEDING_WINDOW = 4
-"""Instants solved together where no camera sees somebody: one alone would stay where it is, and a
-long window would not find out that people walk."""
+"""Instants solved together where few cameras see somebody: where none does, one alone would stay
+where it is, and a long window would not find out that people walk."""
 
 
 SURE = 60.0

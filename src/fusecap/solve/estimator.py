@@ -58,6 +58,9 @@ _LOST_FACTOR = 2.0
 """Of the cost of an instant alone, or a poor one: beyond it a motion has gone astray."""
 _MAX_STEPS = 3
 """Of the window at a new instant; one or two are enough nearly always."""
+_ENOUGH_VIEWS = 3
+"""To find a pose by each instant alone, for a take to go on from; with fewer some stay wrong for
+seconds."""
 _NEAR = 2
 """Instants before and after one, that tell noise of a foot from a step; more would be late."""
 
@@ -214,7 +217,7 @@ class Estimator:
         sound = solution.status is not Status.DIVERGED
         seeding = self.solver.options.seeding
         if self._motion is not None and sound:
-            if seeding and views.any():
+            if seeding and np.count_nonzero(views) >= _ENOUGH_VIEWS:
                 self._motion.reset()
                 self._before.append((observation, solution.theta))
             else:

@@ -99,7 +99,7 @@ class SolverOptions:
     window: int = 8
     """Instants that a live pose is solved together with, itself among them; 1: each alone."""
     seeding: bool = False
-    """Poses for a take to go on from: without error bars, and together only where no camera sees
+    """Poses for a take to go on from: without error bars, and together only where few cameras see
     somebody."""
     ahead: int = 0
     """Instants that a pose may be ahead of pictures, by sensors and as the motion goes on."""

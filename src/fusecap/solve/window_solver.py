@@ -206,12 +206,18 @@ class WindowSolver:
         """Instants that only sensors have reached, each with where it begins; see `Ahead`.
 
         They go on from the window, which stays as it is, and are as many as there is room for.
-        Nobody is said to stand in them: only pictures, or more time, could tell.
+        Nobody is said to stand in them: only pictures, or more time, could tell. Poses that have
+        gone astray would keep each other there: where that costs less they begin at the newest.
         """
         kept, theta = self.count, self._theta[: self.count].copy()
         try:
             for observation, start in coming:
                 self._append(observation, start)
+            reached = self._theta[: self.count]
+            held = reached.copy()
+            held[kept:] = theta[-1]
+            if self._evaluate(held) < self._evaluate(reached):
+                reached[:] = held
             self.refine(max_iterations)
             return Ahead(self._theta[kept : self.count].copy(), *self.newest_spread())
         finally:
