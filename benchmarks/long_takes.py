@@ -92,6 +92,7 @@ def write_recording(path: Path, minutes: float) -> None:
                         cost=1.0,
                         solve_s=1e-3,
                         views=np.ones(len(setup.rig), dtype=bool),
+                        measured=True,
                     )
                     for person, shape in enumerate(shapes)
                 ],

@@ -93,6 +93,7 @@ def estimate_of(timestamp_ns: int, name: str = "anna", shape=SHAPE) -> Estimate:
         cost=0.0,
         solve_s=0.0,
         views=np.zeros(0, dtype=bool),
+        measured=True,
     )
 
 

@@ -110,4 +110,5 @@ def _estimate(take: Take, row: int, frame: int) -> Estimate:
         cost=0.0,
         solve_s=0.0,
         views=np.zeros(0, dtype=bool),
+        measured=True,
     )

@@ -42,6 +42,7 @@ def estimate(tick, theta=None, *, shape=SHAPE, track_id=0, sigma_deg=5.0):
         cost=0.0,
         solve_s=0.0,
         views=np.ones(2, dtype=bool),
+        measured=True,
     )
 
 

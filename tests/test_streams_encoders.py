@@ -473,6 +473,7 @@ def test_pose_of_an_estimate_is_the_pose_of_its_take():
         cost=0.0,
         solve_s=0.0,
         views=np.ones(1, dtype=bool),
+        measured=True,
     )
     live = pose_of_estimate(estimate)
     assert frame_text(frame_of(live)) == frame_text(frame_of(pose))

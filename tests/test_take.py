@@ -47,6 +47,7 @@ def estimate(shape, theta, name="anna", track_id=1, status=Status.CONVERGED, tim
         cost=0.1,
         solve_s=1e-3,
         views=np.ones(4, dtype=bool),
+        measured=True,
     )
 
 

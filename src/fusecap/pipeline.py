@@ -79,6 +79,8 @@ class Step:
     the one that they have."""
     renumbered_since_ns: int | None = None
     """When these went astray; None where sensors' readings must tell."""
+    found_anew: Mapping[str, int] = field(default_factory=dict)
+    """By name, whose pose did not fit and was found anew, and since when [ns] it was wrong."""
     bystanders: tuple[TrackUpdate, ...] = ()
     """Who is no subject but may be one of those who wear sensors."""
     notes: tuple[str, ...] = ()
@@ -192,11 +194,14 @@ class Pipeline:
             results = list(self._pool.map(lambda item: _follow(*item), work))
         self._detections = detections
         tracker = self._sorter if isinstance(self._sorter, Tracker) else None
+        since = {u.name: self._estimators[u.name].found_anew_since_ns for u in followed}
+        found_anew = {name: since_ns for name, since_ns in since.items() if since_ns is not None}
         self._step = Step(
             updates=tuple(updates),
             estimates=tuple(estimate for estimate in results if estimate is not None),
             renumbered=tracker.renumbered if tracker else {},
             renumbered_since_ns=tracker.renumbered_since_ns if tracker else None,
+            found_anew=found_anew,
             bystanders=tuple(tracker.bystanders) if tracker else (),
             notes=tuple(tracker.notes) if tracker else (),
         )

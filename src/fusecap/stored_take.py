@@ -18,11 +18,11 @@ from fusecap.body.shape import BodyShape
 from fusecap.body.skeleton import Skeleton
 from fusecap.errors import TakeError
 from fusecap.inputs import TAKE, NpzFile, read_npz
-from fusecap.take import FORMAT, FORMAT_NAME, MOTION, Take, array_shapes
+from fusecap.take import FORMAT, FORMAT_NAME, MARKS, MOTION, Take, array_shapes
 
 _ENTRIES = (
     *("format", "timestamps_ns", "rate_hz", "subject_names", "skeleton", "bone_names", "parents"),
-    *("heights_m", "offsets_m", "tracked", *MOTION, "provenance"),
+    *("heights_m", "offsets_m", *MARKS, *MOTION, "provenance"),
 )
 _BLOCK = 2048
 """Frames read at a time where all are."""
@@ -54,6 +54,11 @@ class StoredTake:
         _check_format(str(array("format")) if "format" in self._file.names else "")
         self.timestamps_ns: Int[np.ndarray, " t"] = array("timestamps_ns").astype(np.int64)
         self.tracked: Bool[np.ndarray, "s t"] = array("tracked").astype(bool)
+        told = "measured" in self._file.names
+        self.measured: Bool[np.ndarray, "s t"] = (
+            array("measured").astype(bool) if told else self.tracked
+        )
+        """Takes from before there was this mark count as measured wherever they are tracked."""
         names = tuple(array("subject_names").tolist())
         provenance = json.loads(str(array("provenance")))
         if not isinstance(provenance, dict):
@@ -62,6 +67,8 @@ class StoredTake:
         s, t, b = len(names), len(self.timestamps_ns), len(bone_names)
         self._motion = {name: self._file.rows(name) for name in MOTION}
         for name, shape in array_shapes(s, t, b).items():
+            if name == "measured" and not told:
+                continue
             found = self._motion[name].shape if name in MOTION else array(name).shape
             if name in MOTION and self._motion[name].dtype.kind not in "fiu":
                 raise ValueError(f"{name} holds {self._motion[name].dtype}, expected numbers")
@@ -82,6 +89,7 @@ class StoredTake:
                 heights_m=array("heights_m").astype(np.float64),
                 offsets_m=array("offsets_m").astype(np.float64),
                 tracked=self.tracked[:, :0],
+                measured=self.measured[:, :0],
                 provenance=provenance,
                 **{name: np.empty(array_shapes(s, 0, b)[name]) for name in MOTION},
             )
@@ -166,6 +174,7 @@ class StoredTake:
                 self._nothing,
                 timestamps_ns=self.timestamps_ns[frames],
                 tracked=self.tracked[:, frames],
+                measured=self.measured[:, frames],
                 **motion,
             )
         except TakeError as error:

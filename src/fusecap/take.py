@@ -43,6 +43,8 @@ STORED = {
 }
 """The arrays of numbers per subject and frame, and as what a file holds them."""
 MOTION = tuple(STORED)
+MARKS = ("tracked", "measured")
+"""The arrays of marks per subject and frame."""
 
 UNITS = {
     "timestamps_ns": "ns, one clock",
@@ -75,6 +77,10 @@ class Take:
     bone_position_in_world_m: Float[np.ndarray, "s t b 3"]
     bone_rotation_in_world_wxyz: Float[np.ndarray, "s t b 4"]
     tracked: Bool[np.ndarray, "s t"]
+    """Somebody has a pose."""
+    measured: Bool[np.ndarray, "s t"]
+    """A camera or a sensor told of this frame; a pose without is predicted by the motion around.
+    False where there is no pose."""
     bone_sigma_deg: Float[np.ndarray, "s t b"]
     """Expected root mean square error of each bone's rotation in the world."""
     position_sigma_m: Float[np.ndarray, "s t b"]
@@ -100,6 +106,7 @@ class Take:
             raise TakeError(f"offsets_m hold a value that is no number up to {MAX_OFFSET_M:g} m")
         if not ((self.heights_m > 0) & (self.heights_m <= MAX_OFFSET_M)).all():
             raise TakeError(f"heights_m are {self.heights_m}, expected metres above zero")
+        object.__setattr__(self, "measured", self.measured & self.tracked)
         for first in range(0, t, BLOCK):
             self._check_frames(first, first + BLOCK)
 
@@ -150,7 +157,7 @@ class Take:
             subject_names=tuple(self.subject_names[row] for row in kept),
             **{
                 name: getattr(self, name)[kept]
-                for name in ("heights_m", "offsets_m", "tracked", *MOTION)
+                for name in ("heights_m", "offsets_m", *MARKS, *MOTION)
             },
         )
 
@@ -166,7 +173,7 @@ class Take:
         return replace(
             self,
             timestamps_ns=self.timestamps_ns[frames],
-            **{name: getattr(self, name)[:, frames] for name in ("tracked", *MOTION)},
+            **{name: getattr(self, name)[:, frames] for name in (*MARKS, *MOTION)},
         )
 
     def with_theta(
@@ -177,7 +184,8 @@ class Take:
         bone_sigma_deg: Float[np.ndarray, "s t b"] | None = None,
         position_sigma_m: Float[np.ndarray, "s t b"] | None = None,
     ) -> Take:
-        """The same people in other poses; what is not given stays."""
+        """The same people in other poses; what is not given stays, and no new frame is measured."""
+        tracked = self.tracked if tracked is None else tracked
         return take_from_theta(
             theta,
             [self.shape(row) for row in range(len(self.subject_names))],
@@ -185,7 +193,8 @@ class Take:
             rate_hz=self.rate_hz,
             subject_names=self.subject_names,
             skeleton=self.skeleton,
-            tracked=self.tracked if tracked is None else tracked,
+            tracked=tracked,
+            measured=self.measured & tracked,
             bone_sigma_deg=self.bone_sigma_deg if bone_sigma_deg is None else bone_sigma_deg,
             position_sigma_m=(
                 self.position_sigma_m if position_sigma_m is None else position_sigma_m
@@ -242,7 +251,7 @@ def array_shapes(subjects: int, frames: int, bones: int) -> dict[str, tuple[int,
         "theta": (s, t, 3 + 3 * b),
         "bone_position_in_world_m": (s, t, b, 3),
         "bone_rotation_in_world_wxyz": (s, t, b, 4),
-        "tracked": (s, t),
+        **dict.fromkeys(MARKS, (s, t)),
         "bone_sigma_deg": (s, t, b),
         "position_sigma_m": (s, t, b),
     }
@@ -257,11 +266,12 @@ def take_from_theta(
     subject_names: tuple[str, ...],
     skeleton: Skeleton,
     tracked: Bool[np.ndarray, "s t"] | None = None,
+    measured: Bool[np.ndarray, "s t"] | None = None,
     bone_sigma_deg: Float[np.ndarray, "s t b"] | None = None,
     position_sigma_m: Float[np.ndarray, "s t b"] | None = None,
     provenance: Mapping[str, Any] | None = None,
 ) -> Take:
-    """A take of known poses; tracked everywhere and exact unless told."""
+    """A take of known poses; tracked everywhere, measured where tracked and exact unless told."""
     s, t, b = len(subject_names), len(timestamps_ns), skeleton.bone_count
     if tracked is None:
         tracked = np.ones((s, t), dtype=bool)
@@ -289,6 +299,7 @@ def take_from_theta(
         bone_position_in_world_m=position,
         bone_rotation_in_world_wxyz=quaternion,
         tracked=tracked,
+        measured=tracked.copy() if measured is None else measured,
         bone_sigma_deg=bone_sigma_deg,
         position_sigma_m=position_sigma_m,
         provenance=dict(provenance or {}),
@@ -312,10 +323,12 @@ def save_blocks(nothing: Take, blocks: Iterable[Take], path: Path | str) -> None
     `nothing` is the take without its frames. Raises `TakeError`.
     """
     columns = {name: [Spool() for _ in nothing.subject_names] for name in STORED}
-    timestamps_ns, tracked = [nothing.timestamps_ns], [nothing.tracked]
+    timestamps_ns = [nothing.timestamps_ns]
+    marks = {name: [getattr(nothing, name)] for name in MARKS}
     for block in blocks:
         timestamps_ns.append(block.timestamps_ns)
-        tracked.append(block.tracked)
+        for name, blocks_of in marks.items():
+            blocks_of.append(getattr(block, name))
         for name, spools in columns.items():
             for spool, values in zip(spools, getattr(block, name), strict=True):
                 spool.append(values.astype(STORED[name]).tobytes())
@@ -330,7 +343,7 @@ def save_blocks(nothing: Take, blocks: Iterable[Take], path: Path | str) -> None
         "parents": np.array(nothing.parents, dtype=np.int64),
         "heights_m": nothing.heights_m,
         "offsets_m": nothing.offsets_m,
-        "tracked": np.concatenate(tracked, axis=1),
+        **{name: np.concatenate(parts, axis=1) for name, parts in marks.items()},
         "provenance": np.array(json.dumps(nothing.provenance, sort_keys=True, default=str)),
     }
     shapes = array_shapes(len(nothing.subject_names), len(times_ns), len(nothing.bone_names))

@@ -75,11 +75,12 @@ class TakeBuilder:
     def _block(self, first: int, end: int, provenance: Mapping[str, Any]) -> Take:
         b, p = self._skeleton.bone_count, self._skeleton.pose_size
         numbers = np.full((len(self._people), end - first, p + 2 * b), np.nan)
-        tracked = np.zeros(numbers.shape[:2], dtype=bool)
+        tracked, measured = np.zeros((2, *numbers.shape[:2]), dtype=bool)
         for row, person in enumerate(self._people.values()):
-            frames, values = person.between(first, end)
+            frames, values, told = person.between(first, end)
             numbers[row, frames - first] = values
             tracked[row, frames - first] = True
+            measured[row, frames - first] = told
         return take_from_theta(
             np.ascontiguousarray(numbers[:, :, :p]),
             [person.shape for person in self._people.values()],
@@ -88,6 +89,7 @@ class TakeBuilder:
             subject_names=tuple(self._people),
             skeleton=self._skeleton,
             tracked=tracked,
+            measured=measured,
             bone_sigma_deg=np.ascontiguousarray(numbers[:, :, p : p + b]),
             position_sigma_m=np.ascontiguousarray(numbers[:, :, p + b :]),
             provenance=provenance,
@@ -100,6 +102,7 @@ class _Person:
     def __init__(self, skeleton: Skeleton) -> None:
         self.shape = BodyShape.from_height(skeleton, REFERENCE_HEIGHT_M)
         self.frames = array("q")
+        self._measured = array("b")
         self._columns = skeleton.pose_size + 2 * skeleton.bone_count
         self._spool = Spool()
 
@@ -108,12 +111,15 @@ class _Person:
         # Whatever an interrupt left half done is written over.
         at = 8 * self._columns * len(self.frames)
         self._spool.append(np.concatenate(numbers).tobytes(), at)
+        del self._measured[len(self.frames) :]
+        self._measured.append(estimate.measured)
         self.frames.append(frame)
 
-    def between(self, first: int, end: int) -> tuple[np.ndarray, np.ndarray]:
-        """Frames from `first` up to, and without, `end`, and their numbers (n, P + 2 B)."""
+    def between(self, first: int, end: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Frames from `first` up to, and without, `end`: which, numbers (n, P + 2 B), measured."""
         frames = np.frombuffer(self.frames, dtype=np.int64) if self.frames else np.empty(0, int)
         low, high = np.searchsorted(frames, [first, end]).tolist()
         size = 8 * self._columns
         raw = self._spool.read(low * size, (high - low) * size)
-        return frames[low:high].copy(), np.frombuffer(raw).reshape(-1, self._columns)
+        values = np.frombuffer(raw).reshape(-1, self._columns)
+        return frames[low:high].copy(), values, np.array(self._measured[low:high], dtype=bool)

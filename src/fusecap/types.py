@@ -96,6 +96,8 @@ class Estimate:
     """Wall time of the solve alone."""
     views: Bool[np.ndarray, " c"]
     """Which cameras contributed."""
+    measured: bool
+    """A camera or a sensor told of this instant; else the pose goes on from those before."""
 
     @property
     def bone_quality(self) -> Float[np.ndarray, " b"]:

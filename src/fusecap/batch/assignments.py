@@ -120,6 +120,12 @@ class Assignments:
                 self._track[row] = renumbered[self._track[row]]
                 self._seeded[row] = False
 
+    def unseed(self, instant: int, track_id: int) -> None:
+        """What was found of a track at an instant was wrong."""
+        for row in self._rows(instant):
+            if self._track[row] == track_id:
+                self._seeded[row] = False
+
     def settle(self) -> None:
         """Tracks that were confirmed sooner or later bear their subject's name from the start."""
         self._names = sorted(set(self._confirmed.values()))

@@ -97,13 +97,14 @@ def solve_as_live(recording: Recording, progress: Progress | None = None) -> tup
         ),
     )
     solve_s: list[float] = []
-    statuses = Counter()
+    statuses, found_anew = Counter(), Counter()
     with ctrl_c_held() as stop:
         for step in again.steps(progress):
             people = [one for one in step.people.values() if one is not None]
             builder.add(step.timestamp_ns, people)
             for one in people:
                 subjects.add(one)
+            found_anew.update(step.step.found_anew.keys())
             for estimate in step.step.estimates:
                 solve_s.append(estimate.solve_s)
                 statuses[estimate.status.name.lower()] += 1
@@ -114,7 +115,7 @@ def solve_as_live(recording: Recording, progress: Progress | None = None) -> tup
         instants=len(builder),
         duration_s=len(builder) / session.settings.rate_hz,
         cameras=len(again.setup.rig),
-        subjects=subjects.as_report(len(builder)),
+        subjects=subjects.as_report(len(builder), found_anew),
         reprojection_px={},
         solve_ms_median=float(np.median(solve_ms)),
         solve_ms_p99=float(np.percentile(solve_ms, 99)),
@@ -190,6 +191,7 @@ class RecordedMotion:
         people, count = len(self.subject_names), len(frames)
         theta = np.full((people, count, self.skeleton.pose_size), np.nan)
         turn, place = np.full((2, people, count, self.skeleton.bone_count), np.nan)
+        measured = np.zeros((people, count), dtype=bool)
         for at, frame in enumerate(frames):
             for subject, name in enumerate(self.subject_names):
                 row = int(self._rows[subject, frame])
@@ -197,6 +199,7 @@ class RecordedMotion:
                 if isinstance(pose, RecordedPose) and not pose.diverged:
                     theta[subject, at] = pose.theta
                     turn[subject, at] = pose.bone_sigma_deg
+                    measured[subject, at] = pose.measured
                     place[subject, at] = pose.position_sigma_m
         return take_from_theta(
             theta,
@@ -206,6 +209,7 @@ class RecordedMotion:
             subject_names=self.subject_names,
             skeleton=self.skeleton,
             tracked=np.asarray(np.isfinite(theta).all(axis=2)),
+            measured=measured,
             bone_sigma_deg=turn,
             position_sigma_m=place,
             provenance=self.provenance,

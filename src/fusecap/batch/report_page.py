@@ -88,7 +88,11 @@ def _head(take: Take, title: str, notes: Sequence[str]) -> Iterable[str]:
 
 def _people(take: Take) -> Iterable[str]:
     yield "<h2>People</h2>"
-    yield '<p class="quiet">Error bars are medians over tracked frames.</p>'
+    yield (
+        '<p class="quiet">Shares of frames: a camera or a sensor told of the person, or the motion '
+        "around bridges the frame, or nothing is known. Error bars are medians where there is a "
+        "pose.</p>"
+    )
     rows = []
     for row, name in enumerate(take.subject_names):
         tracked = take.tracked[row]
@@ -97,13 +101,21 @@ def _people(take: Take) -> Iterable[str]:
             [
                 name,
                 f"{take.heights_m[row]:.2f}",
-                f"{100 * tracked.mean():.1f} %",
+                f"{100 * take.measured[row].mean():.1f} %",
+                f"{100 * (tracked & ~take.measured[row]).mean():.1f} %",
+                f"{100 * (~tracked).mean():.1f} %",
                 str(max(int((edges == 1).sum()) - 1, 0)),
                 _median(take.bone_sigma_deg[row, tracked], "{:.1f}"),
                 _median(1e3 * take.position_sigma_m[row, tracked], "{:.0f}"),
             ]
         )
-    yield _table(["person", "height m", "tracked", "gaps", "bones +- deg", "joints +- mm"], rows)
+    yield _table(
+        [
+            *("person", "height m", "measured", "predicted", "unknown", "gaps"),
+            *("bones +- deg", "joints +- mm"),
+        ],
+        rows,
+    )
 
 
 def _timelines(take: Take, seen: Seen | None) -> Iterable[str]:
@@ -116,10 +128,12 @@ def _timelines(take: Take, seen: Seen | None) -> Iterable[str]:
     else:
         yield (
             '<p class="quiet">The darker, the more: of a camera the share of keypoints found, of a '
-            f"sensor and of tracking the share of instants. {_looked(seen)}</p>"
+            f"sensor and of people the share of instants. {_looked(seen)}</p>"
         )
     for row, name in enumerate(take.subject_names):
-        labels, rows, times = ["tracked"], [take.tracked[row].astype(float)], [take.time_s]
+        predicted = take.tracked[row] & ~take.measured[row]
+        labels, times = ["measured", "predicted"], [take.time_s, take.time_s]
+        rows = [take.measured[row].astype(float), predicted.astype(float)]
         if seen is not None:
             most = max(int(seen.keypoints.max(initial=0)), 1)
             for camera, found in zip(seen.cameras, seen.keypoints[row], strict=True):

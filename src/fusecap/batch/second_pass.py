@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fusecap.batch.assignments import Assigned, Seed, seed_of
+from fusecap.batch.sorting import tells
 from fusecap.believable import believable_detections, believable_reading
 from fusecap.body.shape import BodyShape
 from fusecap.pipeline import make_estimator, observation_of
@@ -66,6 +67,7 @@ class _Motion:
         for theta, sigmas in settled:
             held = self._held.popleft()
             position, rotation = solver.posed(theta)
+            views = np.asarray((held.observation.keypoints[:, :, 2] > 0.0).any(axis=1))
             last = Estimate(
                 track_id=held.track_id,
                 name=name,
@@ -80,7 +82,8 @@ class _Motion:
                 iterations=held.seed.iterations,
                 cost=held.seed.cost,
                 solve_s=held.seed.solve_s,
-                views=np.asarray((held.observation.keypoints[:, :, 2] > 0.0).any(axis=1)),
+                views=views,
+                measured=bool(views.any()) or tells(held.observation.imu),
             )
             held.instant.people[name] = (last, held.observation)
             held.instant.held -= 1

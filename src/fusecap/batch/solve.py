@@ -73,7 +73,8 @@ class SolveReport:
     duration_s: float
     cameras: int
     subjects: dict[str, dict[str, float]]
-    """Per subject: tracked_share (of all instants), bone_sigma_deg, position_sigma_m, height_m."""
+    """Per subject: tracked_share and measured_share (of all instants), bone_sigma_deg,
+    position_sigma_m, height_m, and found_anew: how often a pose that did not fit was replaced."""
     reprojection_px: dict[str, dict[str, float]]
     """Per camera, in its own pixels: median, p90, and how many keypoints were used."""
     solve_ms_median: float
@@ -206,7 +207,7 @@ def solve_instants(
             instants=len(builder),
             duration_s=len(builder) / setup.rate_hz,
             cameras=len(setup.rig),
-            subjects=subjects.as_report(len(builder)),
+            subjects=subjects.as_report(len(builder), tracked.found_anew),
             reprojection_px=reprojection.summary(),
             solve_ms_median=float(np.median(solve_ms)),
             solve_ms_p99=float(np.percentile(solve_ms, 99)),
@@ -258,6 +259,7 @@ class SubjectSums:
         sums.height_m = estimate.shape.height_m
         if estimate.status is not Status.DIVERGED:
             sums.tracked += 1
+            sums.measured += estimate.measured
             sums.turn_deg.add(estimate.bone_sigma_deg)
             sums.place_m.add(estimate.position_sigma_m)
 
@@ -271,14 +273,18 @@ class SubjectSums:
         """Statures."""
         return {name: sums.height_m for name, sums in self._people.items()}
 
-    def as_report(self, instants: int) -> dict[str, dict[str, float]]:
+    def as_report(
+        self, instants: int, found_anew: Mapping[str, int]
+    ) -> dict[str, dict[str, float]]:
         """As `SolveReport.subjects`."""
         return {
             name: {
                 "tracked_share": sums.tracked / max(instants, 1),
+                "measured_share": sums.measured / max(instants, 1),
                 "bone_sigma_deg": sums.turn_deg.at(0.5),
                 "position_sigma_m": sums.place_m.at(0.5),
                 "height_m": sums.height_m,
+                "found_anew": found_anew.get(name, 0),
             }
             for name, sums in self._people.items()
         }
@@ -287,5 +293,5 @@ class SubjectSums:
 class _Sums:
     def __init__(self) -> None:
         self.height_m = REFERENCE_HEIGHT_M
-        self.tracked = 0
+        self.tracked = self.measured = 0
         self.turn_deg, self.place_m = Quantiles(), Quantiles()

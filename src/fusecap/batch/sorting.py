@@ -52,6 +52,8 @@ class Sorted:
     """Of everybody who was followed."""
     begun: Mapping[int, Collection[str]]
     """By instant, who must be found there anew: until then somebody else was followed."""
+    found_anew: Mapping[str, int]
+    """How often somebody's pose did not fit and was found anew."""
     interrupted: bool
     notes: tuple[str, ...]
 
@@ -76,27 +78,35 @@ def _sort(
     pipeline = Pipeline(replace(setup, options=options))
     notes: list[str] = []
     moved: list[tuple[int, Step]] = []
+    found_anew: dict[str, list[float]] = {}
     for instant in range(len(instants)):
         if stop.asked:
             break
         step = pipeline.step(instants.detections(instant), instants.readings(instant))
         assigned.add([*step.updates, *step.bystanders], step.estimates)
         notes += [f"{instant / setup.rate_hz:.2f} s: {note}" for note in step.notes]
-        moved += [(instant, step)] if step.renumbered else []
+        moved += [(instant, step)] if step.renumbered or step.found_anew else []
+        for name in step.found_anew:
+            found_anew.setdefault(name, []).append(instant / setup.rate_hz)
         if progress:
             progress("sorting", instant + 1, len(instants))
     vote = SensorVote(setup.landmarks, worn_sensors(setup))
     begun: dict[int, set[str]] = {}
     for instant, step in moved:
         names = {u.track_id: u.name for u in step.updates if u.name}
+        for track_id, name in names.items():
+            if name in step.found_anew:
+                since = _first_instant(instants, instant, step.found_anew[name])
+                for row in range(since, instant):
+                    assigned.unseed(row, track_id)
+        if not step.renumbered:
+            continue
         wearers = {i: names[i] for i in step.renumbered.values() if i in names}
         since_ns = step.renumbered_since_ns
         if since_ns is None:
             since = _sensors_began(assigned, instant, step.renumbered, wearers, instants, vote)
         else:
-            since = instant
-            while since and instants.detections(since - 1).timestamp_ns >= since_ns:
-                since -= 1
+            since = _first_instant(instants, instant, since_ns)
         for row in range(since, instant):
             assigned.renumber(row, step.renumbered)
         begun.setdefault(since, set()).update(wearers.values())
@@ -105,9 +115,25 @@ def _sort(
     return Sorted(
         shapes={name: pipeline.estimator(name).shape for name in assigned.names},
         begun=begun,
+        found_anew={name: len(times_s) for name, times_s in found_anew.items()},
         interrupted=stop.asked,
-        notes=tuple(notes),
+        notes=(*notes, *(_posed_anew(name, times_s) for name, times_s in found_anew.items())),
     )
+
+
+def _posed_anew(name: str, times_s: list[float]) -> str:
+    more = f" and {len(times_s) - 1} times more" if len(times_s) > 1 else ""
+    return (
+        f"{name}: the pose did not fit what was seen and was found anew, at {times_s[0]:.2f} s"
+        f"{more}; look at the take there"
+    )
+
+
+def _first_instant(instants: Instants, before: int, since_ns: int) -> int:
+    """The first one at or after a time, of those until `before`."""
+    while before and instants.detections(before - 1).timestamp_ns >= since_ns:
+        before -= 1
+    return before
 
 
 def _sensors_began(
@@ -150,9 +176,10 @@ def _drop_tails(assigned: Assignments, instants: Instants) -> None:
     for instant in range(len(assigned) - 1, -1, -1):
         here, readings = assigned.here(instant), instants.readings(instant)
         going_on &= set(here)
-        going_on |= {name for name, seen in here.items() if seen or _tells(readings.get(name))}
+        going_on |= {name for name, seen in here.items() if seen or tells(readings.get(name))}
         assigned.keep(instant, going_on)
 
 
-def _tells(reading: ImuReading | None) -> bool:
+def tells(reading: ImuReading | None) -> bool:
+    """Whether any sensor measured."""
     return reading is not None and bool(np.isfinite(reading.bone_rotation_in_world).any())

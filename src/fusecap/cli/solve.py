@@ -307,11 +307,12 @@ def _print_report(solved: Solved) -> None:
         styled((str(report.instants), "bold"), f" instants ({report.duration_s:.2f} s), ")
         + styled(f"{report.cameras} cameras, {len(report.subjects)} subjects")
     )
-    people = table_of("subject", "tracked", "bones +- deg", "joints +- mm", "height m")
+    people = table_of("subject", "tracked", "measured", "bones +- deg", "joints +- mm", "height m")
     for name, values in report.subjects.items():
         people.add_row(
             name,
             f"{100 * values['tracked_share']:.1f} %",
+            f"{100 * values['measured_share']:.1f} %",
             f"{values['bone_sigma_deg']:.1f}",
             f"{1e3 * values['position_sigma_m']:.0f}",
             f"{values['height_m']:.2f}",

@@ -111,6 +111,7 @@ class Continuity:
             bone_sigma_deg=sigmas.bone_deg,
             position_sigma_m=sigmas.position_m,
             views=np.zeros_like(self._estimate.views),
+            measured=False,
             iterations=0,
             solve_s=0.0,
         )

@@ -138,6 +138,8 @@ class Engine:
         self._detections = self._cameras.detections(now_ns)
         self._step = self._pipeline.step(self._detections, readings)
         self.notes.extend(self._step.notes)
+        for name in self._step.found_anew:
+            self.notes.append(f"{name}: the pose did not fit what was seen, and was found anew")
         if self._live.poses == "ahead":
             return None
         if self._live.poses == "solved":

@@ -31,6 +31,8 @@ class SubjectReport:
     """Expected error of bones' rotations: mean over instants with a pose of the median bone."""
     position_sigma_m: float
     """The same of joints' places."""
+    found_anew: int
+    """How often a pose that did not fit was replaced."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,6 +96,7 @@ def subject_reports(people: Mapping[str, PersonTally], instants: int) -> dict[st
             measured_share=tally.measured / max(instants, 1),
             bone_sigma_deg=tally.bone_sigma_deg / max(tally.instants, 1),
             position_sigma_m=tally.position_sigma_m / max(tally.instants, 1),
+            found_anew=tally.found_anew,
         )
         for name, tally in people.items()
     }

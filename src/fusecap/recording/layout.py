@@ -101,6 +101,7 @@ def pose_message(estimate: Estimate) -> str:
         f'"iterations":{estimate.iterations},"cost":{_numbers(np.float64(estimate.cost))},'
         f'"solve_s":{_numbers(np.float64(estimate.solve_s))},'
         f'"views":{json.dumps(estimate.views.tolist())},'
+        f'"measured":{json.dumps(estimate.measured)},'
         f'"theta":{_numbers(estimate.theta)},'
         f'"bone_sigma_deg":{_numbers(estimate.bone_sigma_deg)},'
         f'"position_sigma_m":{_numbers(estimate.position_sigma_m)},'
@@ -187,6 +188,7 @@ SCHEMAS = {
             cost=_NUMBER,
             solve_s=_NUMBER,
             views=_list({"type": "boolean"}, "Which cameras contributed"),
+            measured={"type": "boolean"},
             theta=_list(_NUMBER, "Root translation [m], then an angle-axis vector [rad] per bone"),
             bone_sigma_deg=_list(_NUMBER, "Expected error of each bone's rotation"),
             position_sigma_m=_list(_NUMBER, "Expected error of each joint's place"),
@@ -255,6 +257,7 @@ def _pose(values: Mapping[str, Any], known: Known) -> dict[str, Any]:
         "bone_sigma_deg": _floats(values["bone_sigma_deg"], skeleton.bone_count),
         "position_sigma_m": _floats(values["position_sigma_m"], skeleton.bone_count),
         "diverged": values["status"] == "diverged",
+        "measured": values.get("measured", any(values["views"])) is True,
     }
 
 

@@ -132,6 +132,7 @@ class RecordedPose:
     bone_sigma_deg: Float[np.ndarray, " b"]
     position_sigma_m: Float[np.ndarray, " b"]
     diverged: bool
+    measured: bool
 
 
 Item = RecordedEvent | RecordedPose | RecordedBody

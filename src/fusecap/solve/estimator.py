@@ -43,15 +43,15 @@ from fusecap.solve.initialize import (
 from fusecap.solve.options import SolverOptions
 from fusecap.solve.pose_solver import ImuSites, Measurements, PoseSolver, Solution
 from fusecap.solve.uncertainty import grown, sigmas, turn_shares, unknown
+from fusecap.solve.watchdog import FITS, Watchdog
 from fusecap.solve.window_solver import WindowSolver
 from fusecap.types import Estimate, Observation, Status
 
 _DEFAULT_HEIGHT_M = 1.72
 """Of a person nobody has measured yet."""
 _POOR_COST_PER_KEYPOINT = 0.25
-"""½ log(1 + s) per keypoint above which another start is tried: half the keypoints are about 30 px
-off (s = 1 at λ = 1e-3 and full confidence) in a 1920-pixel-wide image."""
-_RESTART_INTERVAL_S = 0.25
+"""½ log(1 + s) per keypoint: half the keypoints are about 30 px off (s = 1 at λ = 1e-3 and full
+confidence) in a 1920-pixel-wide image."""
 _MAX_PREDICTION_S = 0.2
 _RESTART_AFTER_NS = 1_000_000_000
 _LOST_FACTOR = 2.0
@@ -131,12 +131,17 @@ class Estimator:
         self._turn_shares = turn_shares(skeleton)
         self._sigmas = unknown(skeleton)
         self._measured_ns = 0
+        self.found_anew = 0
+        """How often the watchdog replaced a pose that had not fitted."""
+        self.found_anew_since_ns: int | None = None
+        """Of the last instant: since when the replaced pose had not fitted; None: it was not."""
         self._views = np.zeros(len(rig), dtype=bool)
         self._solution: Solution | None = None
         self._previous: Observation | None = None
         self._sites: list[np.ndarray] = []
         self._points: list[tuple[int, np.ndarray]] = []
-        self._last_start_ns = self._last_ns = -(1 << 62)
+        self._watchdog = Watchdog()
+        self._last_ns = -(1 << 62)
 
     @property
     def shape(self) -> BodyShape:
@@ -157,6 +162,7 @@ class Estimator:
             self._previous = None
             self._sites = []
             self._points = []
+            self._watchdog.reset()
             self._begin_motion()
         return self.update(observation, landmarks_in_world_m)
 
@@ -202,12 +208,13 @@ class Estimator:
         views = np.asarray(np.any(observation.keypoints[:, :, 2] > 0, axis=1))
         has_imu = bool(np.isfinite(data.imu_rotation[:, 0, 0]).any())
         started = time.perf_counter()
+        self.found_anew_since_ns = None
         if self._solution is None:
-            solution = self._first(observation, data, landmarks_in_world_m)
+            solution = self._first(observation, data, landmarks_in_world_m, self.model.start_m)
         elif views.any() or has_imu:
             data = self._weighed(data, self._solution.theta)
             near = self.solver.solve(self._solution.theta, data)
-            solution = self._better_start(observation, data, landmarks_in_world_m, near)
+            solution = self._watched(observation, data, landmarks_in_world_m, near)
             if solution is not near:
                 self._begin_motion()
         else:
@@ -229,7 +236,13 @@ class Estimator:
         if not seeding:
             self._sigmas = sigmas(*self._spread(), self._turn_shares)
         self._views = views
-        estimate = self._estimate(observation.timestamp_ns, solution, views, solve_s)
+        estimate = self._estimate(
+            observation.timestamp_ns,
+            solution,
+            views,
+            solve_s,
+            measured=bool(views.any()) or has_imu,
+        )
         self._measured_ns = observation.timestamp_ns
         if sound:
             self._recent.append(estimate)
@@ -292,7 +305,11 @@ class Estimator:
         bars = sigmas(found.turn_rad2, found.place_m2, self._turn_shares)
         return replace(
             self._estimate(
-                observation.timestamp_ns, self._solution, self._views, time.perf_counter() - started
+                observation.timestamp_ns,
+                self._solution,
+                self._views,
+                time.perf_counter() - started,
+                measured=observation.imu is not None,
             ),
             theta=theta,
             bone_position_in_world_m=position,
@@ -338,8 +355,13 @@ class Estimator:
             self._motion.reset()
 
     def _first(
-        self, observation: Observation, data: Measurements, points: np.ndarray
+        self,
+        observation: Observation,
+        data: Measurements,
+        points: np.ndarray,
+        place_m: tuple[float, float] | None,
     ) -> Solution | None:
+        """From nothing but this instant, and where (x, z) somebody is, if that is known."""
         shape, prior, sites = self.solver.shape, self._prior, self.model.sites
         starts = []
         from_points = pose_from_landmarks(
@@ -347,8 +369,8 @@ class Estimator:
         )
         if from_points is not None:
             starts = [from_points]
-        elif self.model.start_m is not None or not (observation.keypoints[:, :, 2] > 0).any():
-            x_m, z_m = self.model.start_m or (0.0, 0.0)
+        elif place_m is not None or not (observation.keypoints[:, :, 2] > 0).any():
+            x_m, z_m = place_m or (0.0, 0.0)
             from_imus = pose_from_imus(shape, prior, sites, data.imu_rotation, x_m=x_m, z_m=z_m)
             if from_imus is not None:
                 starts = [from_imus]
@@ -360,32 +382,28 @@ class Estimator:
         else:
             starts = poses_from_one_view(shape, prior, self._rig, observation.keypoints)
         solutions = [self.solver.solve(start, self._weighed(data, start)) for start in starts]
-        self._last_start_ns = observation.timestamp_ns
         solutions = [s for s in solutions if np.isfinite(s.theta).all() and s.cost < np.inf]
         return min(solutions, key=lambda s: s.cost) if solutions else None
 
-    def _better_start(
+    def _watched(
         self, observation: Observation, data: Measurements, points: np.ndarray, found: Solution
     ) -> Solution:
-        """`found`, or what a start from the triangulated landmarks reaches when that is better."""
-        seen = np.count_nonzero(observation.keypoints[:, :, 2] > 0)
-        due = observation.timestamp_ns - self._last_start_ns >= _RESTART_INTERVAL_S * 1e9
-        if found.cost <= _POOR_COST_PER_KEYPOINT * max(seen, 1) or not due:
+        """`found`, or a pose found anew, where it has not fitted for a while and that fits."""
+        now_ns = observation.timestamp_ns
+        seen = int(np.count_nonzero(observation.keypoints[:, :, 2] > 0))
+        if not self._watchdog.doubts(found.cost, seen, now_ns):
             return found
-        self._last_start_ns = observation.timestamp_ns
-        start = pose_from_landmarks(
-            self.solver.shape,
-            self._landmarks,
-            self._prior,
-            points,
-            self.model.sites,
-            data.imu_rotation,
-        )
-        if start is None:
-            return found
-        other = self.solver.solve(start, data)
+        x_m, z_m = found.theta[[0, 2]].tolist()
+        other = self._first(observation, data, points, (x_m, z_m))
         # The solver's posed body and matrices belong to its last solve, but results are copies.
-        return other if other.cost < 0.9 * found.cost else found
+        since_ns = self._watchdog.tried(
+            other is not None and other.cost < FITS * found.cost, now_ns
+        )
+        if other is None or since_ns is None:
+            return found
+        self.found_anew_since_ns = since_ns
+        self.found_anew += 1
+        return other
 
     def _learn_shape(self, points: np.ndarray) -> None:
         if self._measure is None:
@@ -438,12 +456,18 @@ class Estimator:
         self._sites = []
         known = self._sigmas
         self._sigmas = grown(known, (timestamp_ns - self._measured_ns) * 1e-9)
-        held = self._estimate(timestamp_ns, last, views, 0.0)
+        held = self._estimate(timestamp_ns, last, views, 0.0, measured=False)
         self._sigmas = known
         return held
 
     def _estimate(
-        self, timestamp_ns: int, solution: Solution, views: Bool[np.ndarray, " c"], solve_s: float
+        self,
+        timestamp_ns: int,
+        solution: Solution,
+        views: Bool[np.ndarray, " c"],
+        solve_s: float,
+        *,
+        measured: bool,
     ) -> Estimate:
         return Estimate(
             track_id=self.track_id,
@@ -460,4 +484,5 @@ class Estimator:
             cost=solution.cost,
             solve_s=solve_s,
             views=views,
+            measured=measured,
         )

@@ -86,7 +86,7 @@ class TakePage:
         self._people = People(page.scene, take.skeleton, colours)
         self._controls = PlaybackControls(page.gui, take.time_s)
         with page.gui.add_folder("People"):
-            page.gui.add_html(_legend(take, list(colours.values())))
+            page.gui.add_html(_legend(take, seen, list(colours.values())))
             self._boxes = [
                 page.gui.add_checkbox(f"Show {name}", initial_value=True) for name in colours
             ]
@@ -147,14 +147,14 @@ class TakePage:
                     self._views.show(int(self._take.timestamps_ns[frame]), poses)
 
     def _poses(self, frame: int) -> dict[str, Pose]:
-        """Of who is tracked."""
+        """Of who is tracked; nothing measures the bones of who is predicted."""
         take = self._take.at_frames([frame])
         return {
             name: Pose(
                 shape=self._shapes[row],
                 position_m=take.bone_position_in_world_m[row, 0],
                 rotation=take.bone_rotation_in_world(row)[0],
-                quality=take.bone_quality[row, 0],
+                quality=take.bone_quality[row, 0] * take.measured[row, 0],
             )
             for row, name in enumerate(take.subject_names)
             if take.tracked[row, 0]
@@ -176,7 +176,7 @@ class TakePage:
         return plots
 
 
-def _legend(take: ViewedTake, colours: Sequence[tuple[int, int, int]]) -> str:
+def _legend(take: ViewedTake, some: Take, colours: Sequence[tuple[int, int, int]]) -> str:
     lines = []
     for row, (name, colour) in enumerate(zip(take.subject_names, colours, strict=True)):
         dot = f'<span style="color:{css(colour)};font-size:1.3em">&#9679;</span>'
@@ -184,6 +184,9 @@ def _legend(take: ViewedTake, colours: Sequence[tuple[int, int, int]]) -> str:
             f"{take.heights_m[row]:.2f} m tall, tracked in "
             f"{100 * take.tracked[row].mean():.0f} % of frames"
         )
+        predicted = (some.tracked & ~some.measured)[row].mean()
+        if predicted > 0:
+            about += f", predicted in {100 * predicted:.0f} %: seen by nobody, by the motion around"
         lines.append(f'<div style="{_SMALL}">{dot} <b>{escaped(name)}</b>, {about}</div>')
     what = "Simulated. " if take.provenance.get("simulated") else ""
     note = f"{what}A person's right side is darker; bones that nothing measures are grey."

@@ -1,9 +1,9 @@
 """A tidy table: one row per frame, person and bone, for pandas, R and spreadsheets.
 
-    frame,time_s,person,bone,x_m,y_m,z_m,qw,qx,qy,qz,bone_sigma_deg,position_sigma_m
+    frame,time_s,person,bone,x_m,y_m,z_m,qw,qx,qy,qz,bone_sigma_deg,position_sigma_m,measured
 
 The joint at the bone's root and the quaternion world_from_bone, y up; a person who is not tracked
-has no row in that frame.
+has no row in that frame, and measured is 0 where the pose is predicted by the motion around.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from fusecap.take import Take
 
 COLUMNS = (
     *("frame", "time_s", "person", "bone", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"),
-    *("bone_sigma_deg", "position_sigma_m"),
+    *("bone_sigma_deg", "position_sigma_m", "measured"),
 )
-_NUMBERS = ",%.4f,%.4f,%.4f,%.5f,%.5f,%.5f,%.5f,%.2f,%.4f"
+_NUMBERS = ",%.4f,%.4f,%.4f,%.5f,%.5f,%.5f,%.5f,%.2f,%.4f,%d"
 
 
 def write_csv(take: Take, path: Path, _: ExportOptions) -> None:
@@ -43,12 +43,13 @@ def write_csv(take: Take, path: Path, _: ExportOptions) -> None:
 
 
 def _values(take: Take, person: int, frame: int, time_s: float) -> list[float]:
-    table = np.empty((len(take.bone_names), 11))
+    table = np.empty((len(take.bone_names), 12))
     table[:, 0], table[:, 1] = frame, time_s
     table[:, 2:5] = take.bone_position_in_world_m[person, frame]
     table[:, 5:9] = take.bone_rotation_in_world_wxyz[person, frame]
     table[:, 9] = take.bone_sigma_deg[person, frame]
     table[:, 10] = take.position_sigma_m[person, frame]
+    table[:, 11] = take.measured[person, frame]
     return table.ravel().tolist()
 
 

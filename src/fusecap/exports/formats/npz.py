@@ -1,6 +1,7 @@
 """NumPy arrays of everybody on a rig; the take itself (docs/take.md) has our bones and error bars.
 
-    person_names (S,)  joint_names (J,)  parents (J,)  time_s (T,)  rate_hz  tracked (S, T)
+    person_names (S,)  joint_names (J,)  parents (J,)  time_s (T,)  rate_hz
+    tracked (S, T)  measured (S, T)
     rest_position_m (S, J, 3)  rest_rotation_xyzw (S, J, 4)    in the world, standing at the origin
     position_m (S, T, J, 3)    rotation_xyzw (S, T, J, 4)      in the parent's frame
 
@@ -36,6 +37,7 @@ def write_npz(take: Take, path: Path, options: ExportOptions) -> None:
         "time_s": take.time_s,
         "rate_hz": np.array(take.rate_hz),
         "tracked": take.tracked[rows],
+        "measured": take.measured[rows],
         "rest_position_m": np.array([one.position_m for one in rest]),
         "rest_rotation_xyzw": np.array(
             [Rotation.from_matrix(one.rotation).as_quat() for one in rest]
