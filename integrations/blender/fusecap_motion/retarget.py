@@ -138,6 +138,13 @@ class Follower:
                 laid[bone] = _least_turns((ours[1] - ours[0])[None], theirs[None])[0]
         for side in _SIDES:
             laid[f"{side}_hand"] = laid.get(f"{side}_forearm", np.eye(3))
+            foot, toes = self.bones[f"{side}_foot"], self.bones.get(f"{side}_toes")
+            if toes is not None:  # only how far out: heels are of many heights
+                out = self._faces.T @ (self._rest_m[toes] - self._rest_m[foot])
+                yaw = np.arctan2(out[0], -out[1])
+                laid[f"{side}_foot"] = laid[f"{side}_toes"] = _from_rotvec(
+                    np.array([[0.0, 0.0, yaw]])
+                )[0]
         known = {bone: node for bone, node in self.bones.items() if bone in self._ours}
         follow = {
             node: (bone, bone, 0.0, laid.get(bone, np.eye(3))) for bone, node in known.items()

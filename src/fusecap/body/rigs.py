@@ -7,7 +7,7 @@ joint of a rig that is also one of ours is where the take has it, in every frame
     native    our bones, and the bones that connect them: pelvis, clavicles
     mixamo    mixamorig:...; y along the bone              humanik   Hips, LeftUpLeg, ...
     unity     as Unity's humanoid avatar names them        vrm       as VRM 1.0 names them
-    ue5       Manny's; root on the floor, arms at 45 degrees, x along the bone
+    ue5       Manny's, his reference pose and axes too; root on the floor
     rokoko    Hips, Spine1, ..., LeftThigh                 xsens     MVN's segments
 
 Skeletons with three spine bones get ours folded: the lowest turns halfway between our two lowest.
@@ -15,6 +15,7 @@ Skeletons with three spine bones get ours folded: the lowest turns halfway betwe
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from fusecap.body.skeleton import EXTENDED23
@@ -36,6 +37,24 @@ class RigJoint:
     """Or that share of the way to another one."""
 
 
+Direction = tuple[float, float, float]
+_UP, _DOWN, _LEFT = (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (1.0, 0.0, 0.0)
+_FORWARD, _BACK = (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JointAxes:
+    """How a joint's axes lie in a T-pose; they turn with the limb to how it really rests."""
+
+    along: str
+    """The axis along the bone, "-x" against it."""
+    not_along: Direction | None = None
+    """Where that axis points instead."""
+    second: str
+    points: Direction
+    """Where another axis points, as nearly as the first allows."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class RigPreset:
     """What a receiving program calls joints, and how its character stands at rest."""
@@ -43,10 +62,15 @@ class RigPreset:
     name: str
     about: str
     joints: tuple[RigJoint, ...]
-    along: str = ""
-    """The axis of a joint that points along its bone at rest; "": all axes are the world's."""
+    axes: Mapping[str, JointAxes] = field(default_factory=dict)
+    """By our bones without their side, "root" for what never moves, "" for others.
+
+    All axes are the world's where it is empty.
+    """
+    holder: str = ""
+    """What its program wants the node above the root called in FBX; "" for the person's name."""
     mirrored: bool = False
-    """Whether that axis points against the bone on the right side."""
+    """Whether axes of the right side point against the mirror image of the left one's."""
     rest_deg: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     """Angle-axis vectors of bones at rest [deg], local; a T-pose without."""
 
@@ -189,11 +213,34 @@ def _manny() -> tuple[RigJoint, ...]:
     )
 
 
+_MIXAMO_AXES = {
+    "": JointAxes(along="y", second="z", points=_FORWARD),
+    "foot": JointAxes(along="y", second="z", points=_UP),
+    "toes": JointAxes(along="y", second="z", points=_UP),
+}
+_MANNY_AXES = {
+    "root": JointAxes(along="x", not_along=_LEFT, second="z", points=_UP),
+    "": JointAxes(along="x", second="y", points=_BACK),
+    "hand": JointAxes(along="x", second="y", points=_DOWN),
+    "thigh": JointAxes(along="-x", second="y", points=_BACK),
+    "shank": JointAxes(along="-x", second="y", points=_BACK),
+    "foot": JointAxes(along="x", not_along=_UP, second="y", points=_BACK),
+    "toes": JointAxes(along="x", second="y", points=_UP),
+}
+_MANNY_RESTS_DEG = {
+    "upper_arm": (13.4, 6.2, -41.4),
+    "forearm": (4.5, -28.4, -1.1),
+    "hand": (-0.9, 3.8, -12.1),
+    "thigh": (0.3, 0.0, 6.6),
+    "shank": (4.5, 0.0, -1.8),
+    "foot": (-4.58, 4.83, -5.01),
+}
+"""Of the left side, from the published local rotations of Unreal's skeleton; soles level."""
 _UNITY_ARM = ("{Side}Shoulder", "{Side}UpperArm", "{Side}LowerArm", "{Side}Hand")
 _UNITY_LEG = ("{Side}UpperLeg", "{Side}LowerLeg", "{Side}Foot", "{Side}Toes")
 _VRM_ARM = ("{side}Shoulder", "{side}UpperArm", "{side}LowerArm", "{side}Hand")
 _VRM_LEG = ("{side}UpperLeg", "{side}LowerLeg", "{side}Foot", "{side}Toes")
-_MVN_ARM = ("{Side}Shoulder", "{Side}UpperArm", "{Side}Forearm", "{Side}Hand")
+_MVN_ARM = ("{Side}Shoulder", "{Side}UpperArm", "{Side}ForeArm", "{Side}Hand")
 _MVN_LEG = ("{Side}UpperLeg", "{Side}LowerLeg", "{Side}Foot", "{Side}Toe")
 
 PRESETS = {
@@ -204,15 +251,20 @@ PRESETS = {
             name="mixamo",
             about="Mixamo's characters and the tools made for them",
             joints=_prefixed("mixamorig:", _HUMANIK),
-            along="y",
+            axes=_MIXAMO_AXES,
         ),
         RigPreset(
             name="ue5",
             about="Unreal's Manny",
+            holder="Armature",
             joints=_manny(),
-            along="x",
+            axes=_MANNY_AXES,
             mirrored=True,
-            rest_deg={"left_upper_arm": (0.0, 0.0, -45.0), "right_upper_arm": (0.0, 0.0, 45.0)},
+            rest_deg={
+                f"{side}_{bone}": (x, sign * y, sign * z)
+                for side, sign in (("left", 1.0), ("right", -1.0))
+                for bone, (x, y, z) in _MANNY_RESTS_DEG.items()
+            },
         ),
         RigPreset(
             name="unity",

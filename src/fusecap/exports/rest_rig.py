@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fusecap.body.pose import forward_kinematics
-from fusecap.body.rigs import RigJoint, RigPreset
+from fusecap.body.rigs import RigPreset
 from fusecap.body.shape import BodyShape, end_offsets_m
 from fusecap.body.skeleton import EXTENDED23
 
@@ -23,6 +23,8 @@ class RestRig:
     """On `EXTENDED23`."""
     bone_rest: Float[np.ndarray, "b 3 3"]
     """Of our bones, in the world."""
+    bone_rest_positions_m: Float[np.ndarray, "b 3"]
+    """Of our bones' joints, in the world."""
     position_m: Float[np.ndarray, "j 3"]
     rotation: Float[np.ndarray, "j 3 3"]
     tip_m: Float[np.ndarray, "j 3"]
@@ -31,15 +33,6 @@ class RestRig:
     def rest_of(self, bone: str) -> Float[np.ndarray, "3 3"]:
         """Of one of our bones, in the world."""
         return self.bone_rest[EXTENDED23.bone(bone)]
-
-    @cached_property
-    def bone_rest_positions_m(self) -> Float[np.ndarray, "b 3"]:
-        """Of our bones' joints, in the world."""
-        place = np.zeros((EXTENDED23.bone_count, 3))
-        place[0, 1] = self.shape.standing_root_height_m
-        for bone, parent in enumerate(EXTENDED23.parents[1:], start=1):
-            place[bone] = place[parent] + self.bone_rest[parent] @ self.shape.offsets_m[bone]
-        return place
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -85,14 +78,16 @@ class RestRig:
 
 def rest_rig(preset: RigPreset, shape: BodyShape) -> RestRig:
     """The preset on a body of `EXTENDED23`."""
-    local = np.zeros((1, EXTENDED23.bone_count, 3))
+    local = np.zeros((EXTENDED23.bone_count, 3))
     for bone, vector_deg in preset.rest_deg.items():
-        local[0, EXTENDED23.bone(bone)] = np.radians(vector_deg)
-    theta = np.zeros((1, EXTENDED23.pose_size))
-    theta[:, 3:] = local.reshape(1, -1)
+        local[EXTENDED23.bone(bone)] = np.radians(vector_deg)
+    theta = np.zeros((2, EXTENDED23.pose_size))
+    theta[1, 3:] = local.ravel()
     theta[:, 1] = shape.standing_root_height_m
     positions, rotations = forward_kinematics(shape, theta)
-    bone_position_m, bone_rest = positions[0], rotations[0]
+    bone_position_m, bone_rest = positions[1], rotations[1]
+    ankle = EXTENDED23.bone("left_foot")
+    bone_position_m[:, 1] -= (positions[1] - positions[0])[ankle, 1]  # as high as standing straight
 
     def place(bone: str) -> np.ndarray:
         return bone_position_m[EXTENDED23.bone(bone)] if bone else np.zeros(3)
@@ -105,14 +100,16 @@ def rest_rig(preset: RigPreset, shape: BodyShape) -> RestRig:
             position_m[index] += share * (place(target) - position_m[index])
     tip_m = _tips(preset, shape, position_m, bone_rest)
     rotation = np.tile(np.eye(3), (len(names), 1, 1))
-    if preset.along:
-        for index, joint in enumerate(preset.joints):
-            if joint.turns_with:
-                rotation[index] = _along(preset, joint, tip_m[index] - position_m[index])
+    for index, joint in enumerate(preset.joints):
+        if preset.axes:
+            bone = joint.turns_with[0] if joint.turns_with else ""
+            turn = bone_rest[EXTENDED23.bone(bone)] if bone else np.eye(3)
+            rotation[index] = _axes(preset, bone, tip_m[index] - position_m[index], turn)
     return RestRig(
         preset=preset,
         shape=shape,
         bone_rest=bone_rest,
+        bone_rest_positions_m=bone_position_m,
         position_m=position_m,
         rotation=rotation,
         tip_m=tip_m,
@@ -140,16 +137,19 @@ def _tips(
     return tips
 
 
-def _along(
-    preset: RigPreset, joint: RigJoint, bone_m: Float[np.ndarray, "3"]
+def _axes(
+    preset: RigPreset, bone: str, along_m: Float[np.ndarray, "3"], turn: Float[np.ndarray, "3 3"]
 ) -> Float[np.ndarray, "3 3"]:
-    """The axis along the bone, z as nearly forward as that allows (or up)."""
-    first = bone_m / np.linalg.norm(bone_m)
-    if preset.mirrored and joint.turns_with[0].startswith("right_"):
-        first = -first
-    forward = np.array([0.0, 0.0, 1.0]) if abs(first[2]) < 0.7 else np.array([0.0, 1.0, 0.0])
-    z = forward - first * (first @ forward)
-    z /= np.linalg.norm(z)
-    if preset.along == "x":
-        return np.stack([first, np.cross(z, first), z], axis=1)
-    return np.stack([np.cross(first, z), first, z], axis=1)
+    """A joint's axes in the world, as columns; `turn` is what its bone has turned from a T-pose."""
+    side, _, bare = bone.partition("_")
+    told = preset.axes.get(bare if bone else "root", preset.axes[""])
+    sign = -1.0 if preset.mirrored and side == "right" else 1.0
+    first = along_m if told.not_along is None else turn @ np.array(told.not_along)
+    first = first / np.linalg.norm(first) * (-sign if told.along.startswith("-") else sign)
+    second = sign * turn @ np.array(told.points)
+    second -= first * (first @ second)
+    axes = {told.along[-1]: first, told.second: second / np.linalg.norm(second)}
+    (third,) = {*"xyz"} - {*axes}
+    after = {"x": ("y", "z"), "y": ("z", "x"), "z": ("x", "y")}[third]
+    axes[third] = np.cross(axes[after[0]], axes[after[1]])
+    return np.stack([axes[axis] for axis in "xyz"], axis=1)

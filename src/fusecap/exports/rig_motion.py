@@ -127,7 +127,8 @@ def _on_joints(
     for index, joint in enumerate(rest.preset.joints):
         if not joint.turns_with:
             place_m[:, index] = rest.position_m[index]
-            world.append(Rotation.identity(frames))
+            still = Rotation.from_matrix(rest.rotation[index])
+            world.append(Rotation.identity(frames) * still)
             continue
         bones = [EXTENDED23.bone(name) for name in joint.turns_with]
         turn = turns[bones[0]]

@@ -56,8 +56,10 @@ def read_character(path: Path) -> Character:
     order = _from_parents(parents, path)
     count = len(nodes)
     position, rotation, scale = np.zeros((count, 3)), np.empty((count, 3, 3)), np.ones(count)
+    sizes = np.ones((count, 3))
     for index, node in enumerate(nodes):
-        position[index], rotation[index], scale[index] = _local(node, index, path)
+        position[index], rotation[index], sizes[index] = _local(node)
+        scale[index] = sizes[index, 0]
     world_position, world_rotation = position.copy(), rotation.copy()
     world_scale = scale.copy()
     for index in order:
@@ -70,6 +72,7 @@ def read_character(path: Path) -> Character:
     joints = {joint for skin in tree.get("skins", ()) for joint in skin.get("joints", ())}
     if not joints:
         raise InputError(f"{path}: has no skin, so there is no rig to move")
+    _check_sizes(nodes, sizes, joints, parents, path)
     return Character(
         path=path,
         tree=tree,
@@ -125,7 +128,8 @@ def _from_parents(parents: list[int], path: Path) -> list[int]:
     return order
 
 
-def _local(node: dict[str, Any], index: int, path: Path) -> tuple[np.ndarray, np.ndarray, float]:
+def _local(node: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Position, rotation and sizes of a node in its parent."""
     if "matrix" in node:
         matrix = np.array(node["matrix"], dtype=float).reshape(4, 4).T
         sizes = np.linalg.norm(matrix[:3, :3], axis=0)
@@ -135,12 +139,27 @@ def _local(node: dict[str, Any], index: int, path: Path) -> tuple[np.ndarray, np
         turn = Rotation.from_quat(np.array(node.get("rotation", (0, 0, 0, 1)), dtype=float))
         rotation = turn.as_matrix()
         sizes = np.array(node.get("scale", (1, 1, 1)), dtype=float)
-    if not np.allclose(sizes, sizes[0], rtol=1e-3) or sizes[0] <= 0:
-        raise InputError(
-            f"{path}: node '{node.get('name', index)}' is scaled by {sizes.round(3).tolist()}; "
-            "apply scales in the program that made it"
-        )
-    return position, rotation, float(sizes[0])
+    return position, rotation, sizes
+
+
+def _check_sizes(
+    nodes: list[dict[str, Any]],
+    sizes: Float[np.ndarray, "n 3"],
+    joints: set[int],
+    parents: list[int],
+    path: Path,
+) -> None:
+    """Joints, and what they hang on, are of one size in all directions."""
+    for joint in sorted(joints):
+        index = joint
+        while index >= 0:
+            size = sizes[index]
+            if not np.allclose(size, size[0], rtol=1e-3) or size[0] <= 0:
+                raise InputError(
+                    f"{path}: node '{nodes[index].get('name', index)}' is scaled by "
+                    f"{size.round(3).tolist()}; apply scales in the program that made it"
+                )
+            index = parents[index]
 
 
 def _told(tree: dict[str, Any]) -> dict[str, int]:

@@ -184,6 +184,12 @@ class _Moved:
                 laid[bone] = least_turns(ours[None], theirs[None])[0]
         for side in ("left", "right"):
             laid[f"{side}_hand"] = laid.get(f"{side}_forearm", np.eye(3))
+            foot, toes = self._bones[f"{side}_foot"], self._bones.get(f"{side}_toes")
+            if toes is not None:  # only how far out: heels are of many heights
+                along = character.world_position_m[toes] - character.world_position_m[foot]
+                out = self._faces.T @ along
+                yaw = Rotation.from_rotvec([0.0, np.arctan2(out[0], out[2]), 0.0]).as_matrix()
+                laid[f"{side}_foot"] = laid[f"{side}_toes"] = yaw
         followed = {node: (bone, bone, 0.0) for bone, node in self._bones.items()}
         followed |= dict(zip(mapped.spine, spine_shares(len(mapped.spine)), strict=True))
         for node, (one, other, share) in followed.items():

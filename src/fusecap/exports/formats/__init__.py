@@ -15,7 +15,7 @@ FORMATS = {
     "bvh": "a skeleton and its rotations, for Blender, Unity, Unreal, MotionBuilder",
     "glb": "everybody with a body, for viewers, Blender and engines",
     "usd": "everybody with a body (UsdSkel), for Omniverse, Houdini, Maya",
-    "fbx": "everybody with a body, for Unreal, Unity, MotionBuilder, Maya; needs Blender",
+    "fbx": "a person with a body, for Unreal, Unity, MotionBuilder, Maya; needs Blender",
     "html": "a page that plays the take in any browser, without a server",
     "vrma": "a person's motion for any VRM avatar",
     "csv": "a tidy table of bones, for pandas, R and spreadsheets",

@@ -52,7 +52,9 @@ def write_bvh(take: Take, path: Path, options: ExportOptions) -> None:
     for joint in nested:
         orders[joint] = best_order(rotation[:, joint])
         if joint in motion.rest.travelling:
-            columns.append(motion.position_m[:, joint] * scale)
+            parent = motion.rest.parents[joint]
+            axes = motion.rest.rotation[parent] if parent >= 0 else np.eye(3)
+            columns.append(motion.position_m[:, joint] @ axes.T * scale)
         columns.append(np.degrees(euler_rad(rotation[:, joint], orders[joint])))
     lines = [
         *_hierarchy(motion.rest, orders, scale),

@@ -1,4 +1,7 @@
-"""FBX, which Blender writes from our GLB: for Unreal, Unity, MotionBuilder, Maya."""
+"""FBX, which Blender writes from our GLB: for Unreal, Unity, MotionBuilder, Maya.
+
+A person has a file: game engines want one skeleton in each, and joints whose names are unique.
+"""
 
 from __future__ import annotations
 
@@ -13,14 +16,14 @@ from fusecap.take import Take
 
 
 def write(take: Take, path: Path, options: ExportOptions) -> None:
-    """Writes everybody who is tracked, whole or not at all; raises `InputError` without Blender."""
-    still, people = people_at_rest(rig_motions(take, options.rig))
+    """Writes one person, whole or not at all; raises `InputError` without Blender."""
+    still, [(motion, nodes)] = people_at_rest(rig_motions(take, options.rig))
+    holder = next(node for node in still.tree["nodes"] if nodes[0] in node.get("children", ()))
+    holder["name"] = motion.rest.preset.holder or motion.name
+    places, turns = motion.in_world()
     moves = {
         node: NodeMotion(rest=rest, turn=turn, place_m=place)
-        for motion, nodes in people
-        for node, rest, place, turn in zip(
-            nodes, motion.rest.rotation, *motion.in_world(), strict=True
-        )
+        for node, rest, place, turn in zip(nodes, motion.rest.rotation, places, turns, strict=True)
     }
     write_fbx(still, moves, path, time_s=take.time_s, rate_hz=take.rate_hz)
 
@@ -28,7 +31,7 @@ def write(take: Take, path: Path, options: ExportOptions) -> None:
 FORMAT = TakeFormat(
     suffix=".fbx",
     write=write,
-    per_person=False,
+    per_person=True,
     has_rig=True,
     holds=True,
     check_needs=blender_command,
