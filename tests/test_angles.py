@@ -18,6 +18,7 @@ from fusecap.angles.joints import JOINTS
 from fusecap.body.skeleton import EXTENDED23, PAPER21
 from fusecap.cli import app
 from fusecap.errors import InputError, TakeError
+from fusecap.feet import floor_velocity
 from fusecap.take import save_take
 from motions import any_poses, person, take_of
 
@@ -307,3 +308,45 @@ def test_one_frame_is_enough_and_nobody_is_an_error(tmp_path):
     with pytest.raises(TakeError, match="left_knee_flexion"):
         joint_angles(one).curve("a", "left_knee_flexon")
     assert joint_angles(one.of_frames(0, 0)).deg.shape[1] == 0
+
+
+def on_a_treadmill(belt_m_s: float, frames: int = 400):
+    """Legs swing about the hips, which stay; feet go back with the belt and forward lifted."""
+    shape, time_s = person(), np.arange(frames) / 60
+    theta = np.zeros((1, frames, PAPER21.pose_size))
+    theta[0, :, 1] = shape.standing_root_height_m
+    leg_m, half_s = shape.standing_root_height_m, 0.55
+    for side, phase in (("left", 0.0), ("right", 0.5)):
+        cycle = (time_s / (2 * half_s) + phase) % 1.0
+        back = cycle < 0.55
+        reach = belt_m_s * half_s * np.where(back, 1.1 * (0.5 - cycle / 0.55), 0.0)
+        swing = (cycle - 0.55) / 0.45
+        reach = np.where(back, reach, belt_m_s * half_s * 1.1 * (swing - 0.5))
+        theta[0, :, 3 + 3 * PAPER21.bone(f"{side}_thigh")] = -np.arcsin(reach / leg_m)
+        bent = np.where(back, 0.0, np.sin(np.pi * np.clip(swing, 0, 1)))
+        theta[0, :, 3 + 3 * PAPER21.bone(f"{side}_shank")] = 1.2 * bent
+    return take_of(theta, [shape], names=("a",))
+
+
+def test_on_a_treadmill_both_feet_have_cycles():
+    take = on_a_treadmill(1.1)
+    assert floor_velocity(take, 0) == pytest.approx([0, 0, -1.1], abs=0.2)
+    found = joint_angles(take)
+    for side in ("left", "right"):
+        cycles = gait_cycles(take, found, 0, side)
+        assert len(cycles.deg) >= 4
+        assert np.diff(cycles.start_s) == pytest.approx(1.1, abs=0.06)
+
+
+def test_a_floor_does_not_move_under_who_stands_walks_or_is_not_there():
+    for take in (two_walkers(), posed({}), with_gap(on_a_treadmill(1.1), slice(0, 400))):
+        assert not floor_velocity(take, 0).any()
+
+
+def test_a_side_without_a_cycle_is_told_and_why(tmp_path):
+    save_take(two_walkers(), tmp_path / "duo.npz")
+    result = fusecap_angles(tmp_path / "duo.npz", "--gait")
+    assert result.exit_code == 0
+    words = " ".join(result.output.split())
+    for side in ("left", "right"):
+        assert f"no gait cycle of the {side} foot" in words

@@ -25,6 +25,23 @@ class GaitCycles:
     start_s: Float[np.ndarray, " c"]
     names: tuple[str, ...]
     deg: Float[np.ndarray, "c 101 a"]
+    strikes: int
+    """How often the foot came down, also where that made no cycle."""
+
+    @property
+    def why_none(self) -> str:
+        """Of a side without a cycle."""
+        if not self.strikes:
+            return (
+                "it is nowhere low and slow after a step; is the floor at y = 0, and are feet seen "
+                "or worn?"
+            )
+        if self.strikes == 1:
+            return "it comes down once"
+        return (
+            f"it comes down {self.strikes} times, but no two strikes lie {_SHORTEST_S:g} to "
+            f"{_LONGEST_S:g} s apart with the person followed between them"
+        )
 
     @property
     def mean_deg(self) -> Float[np.ndarray, "101 a"]:
@@ -60,6 +77,7 @@ def gait_cycles(take: Take, angles: JointAngles, subject: int, side: str) -> Gai
             starts.append(time_s[0])
     return GaitCycles(
         side=side,
+        strikes=len(strikes),
         start_s=np.array(starts),
         names=tuple(angles.names[column] for column in columns),
         deg=np.array(cycles).reshape(-1, len(PERCENT), len(columns)),

@@ -19,7 +19,7 @@ from matplotlib.image import AxesImage
 
 from fusecap.batch.seen import Seen
 from fusecap.edits.edit import SOLVE_REPORT
-from fusecap.feet import foot_events, standing
+from fusecap.feet import foot_events, on_floor
 from fusecap.findings import Finding
 from fusecap.take import Take
 
@@ -253,10 +253,13 @@ def _contacts(take: Take) -> Iterable[str]:
     if not {"left_foot", "right_foot", "left_toes", "right_toes"} <= {*take.bone_names}:
         return
     yield "<h2>Feet on the floor</h2>"
-    yield '<p class="quiet">Low and slow ankles or toes over a floor at y = 0.</p>'
+    yield (
+        '<p class="quiet">Low and slow ankles or toes over a floor at y = 0; on a treadmill from '
+        "farthest before the hips to farthest behind.</p>"
+    )
     rows = []
     for row, name in enumerate(take.subject_names):
-        stands = [standing(take, row, side) for side in ("left", "right")]
+        stands = [on_floor(take, row, side) for side in ("left", "right")]
         strikes = [event.side for event in foot_events(take, row) if event.strikes]
         tracked = max(int(take.tracked[row].sum()), 1)
         rows.append(

@@ -153,8 +153,9 @@ def _angles_of(
             cycles[name] = {each.side: len(each.deg) for each in sides}
             if any(cycles[name].values()):
                 plot_gait(sides, beside(row, "_gait.png"))
-            else:
-                note(f"'{name}' has no gait cycle: no foot strikes twice, 0.5 to 2.5 s apart")
+            for each in sides:
+                if not len(each.deg):
+                    note(f"'{name}' has no gait cycle of the {each.side} foot: {each.why_none}")
     list_made(take, files)
     summary = {
         found.subject_names[row]: _summary(found.names, found.deg[row], found.sd_deg[row])
