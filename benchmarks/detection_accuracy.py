@@ -47,13 +47,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("keypoints", type=Path, help="with folders cam01 to cam04")
     parser.add_argument("openpose", type=Path)
+    parser.add_argument("--landmarks", default="coco17", choices=("coco17", "blazepose33"))
     arguments = parser.parse_args()
+    landmarks = LANDMARK_SETS[arguments.landmarks]
     others = openpose(arguments.openpose)
     print("view   people/frame  compared  missed  median px  90 % px  sides swapped")
     for folder in sorted(arguments.keypoints.glob("cam0?")):
-        track = read_keypoints(folder, name=folder.name, landmarks=COCO, rate_hz=60.0)
+        track = read_keypoints(folder, name=folder.name, landmarks=landmarks, rate_hz=60.0)
         apart, compared, missed, swapped = [], 0, 0, 0
-        for frame, people in enumerate(track.people):
+        for frame, found in enumerate(track.people):
+            people = found[:, : len(COCO.landmark_names)]  # which come first in both
             for other in others.get((int(folder.name[-2:]), frame), ()):
                 if np.sum(other[:, 2] > SURE) < LEAST:
                     continue

@@ -12,7 +12,7 @@ from fusecap.errors import InputError, SessionError
 from fusecap.sources.folder_survey import survey
 from fusecap.sources.sensor_bones import bone_of
 from fusecap.sources.session_draft import draft
-from fusecap.sources.session_file import load_session
+from fusecap.sources.session_file import load_session, parse_session
 
 
 @pytest.mark.parametrize(
@@ -70,6 +70,34 @@ def test_command_writes_once_and_never_over_a_session(tmp_path):
     assert result.exit_code == 0 and "cam1.mp4" in (tmp_path / "session.toml").read_text()
     again = CliRunner().invoke(app, ["init", str(tmp_path)])
     assert isinstance(again.exception, SessionError)
+
+
+def test_networks_that_are_here_are_named_where_videos_need_them(tmp_path, monkeypatch):
+    cache = tmp_path / "cache" / "models"
+    cache.mkdir(parents=True)
+    monkeypatch.setenv("FUSECAP_CACHE", str(cache.parent))
+
+    def drafted(name):
+        folder = tmp_path / name
+        folder.mkdir()
+        (folder / "cam1.mp4").write_bytes(b"")
+        assert CliRunner().invoke(app, ["init", str(folder)]).exit_code == 0
+        return parse_session(folder).detector
+
+    assert drafted("nothing").model is None
+    for file in ("blazepose-lite.tflite", "blazepose-full.tflite", "blazepose-person.tflite"):
+        (cache / file).touch()
+    blaze = drafted("blazepose")
+    assert (blaze.model, blaze.person_model) == ("blazepose-full", "blazepose-person")
+    (cache / "rtmo-s.onnx").touch()
+    assert (drafted("whole").model, drafted("again").person_model) == ("rtmo-s", None)
+    for file in ("rtmpose-m-halpe26.onnx", "rtmdet-nano-person.onnx"):
+        (cache / file).touch()
+    assert drafted("usual").model is None
+    only_keypoints = survey(tmp_path / "nothing")
+    keypoint_folder(tmp_path / "nothing" / "cam1_json", 78)
+    assert "[detector]" in draft(only_keypoints, {"model": "rtmo-s"})
+    assert "[detector]" not in draft(survey(tmp_path / "nothing"), {"model": "rtmo-s"})
 
 
 def test_folder_without_a_recording_is_refused_with_words(tmp_path):

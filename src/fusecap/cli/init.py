@@ -20,6 +20,8 @@ def init(
     as_json: Json = False,
 ) -> None:
     """Write a first session.toml from the videos, keypoints, calibration, sensors in a folder."""
+    from fusecap.detect.detector import DEFAULT_MODEL, DEFAULT_PERSON_MODEL
+    from fusecap.detect.model_store import networks_here
     from fusecap.errors import SessionError
     from fusecap.files import written_whole
     from fusecap.sources.folder_survey import survey
@@ -30,7 +32,9 @@ def init(
     if target.exists():
         raise SessionError(f"{target}: is there already; edit it, or move it away first")
     found = survey(folder)
-    text = draft(found)
+    here = networks_here()
+    usual = here == {"model": DEFAULT_MODEL, "person_model": DEFAULT_PERSON_MODEL}
+    text = draft(found, {} if usual else here)
     with written_whole(target) as file:
         file.write(text.encode())
     if as_json:

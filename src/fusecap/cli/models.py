@@ -85,7 +85,11 @@ def import_packages(
     for package in packages:
         for name in import_models(package):
             console.print(f"{name}: {MODELS[name].about}; {MODELS[name].licence}", soft_wrap=True)
-    console.print("use them by name: model and person_model under [detector] in session.toml")
+    console.print(
+        "fusecap init names them in new sessions; in others write model and person_model under "
+        "[detector]",
+        soft_wrap=True,
+    )
 
 
 def ask_for_networks(options: DetectorOptions, *, quiet: bool) -> None:
@@ -97,7 +101,7 @@ def ask_for_networks(options: DetectorOptions, *, quiet: bool) -> None:
 
     model = MODELS.get(options.model)
     names = [options.model]
-    if model is None or not model.whole_images:
+    if model is None or model.finds == "keypoints":
         names.append(options.person_model)
     missing = {name: one for name in dict.fromkeys(names) if (one := to_download(name))}
     if quiet or not sys.stdin.isatty() or not any(one.url for one in missing.values()):

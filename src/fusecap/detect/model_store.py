@@ -26,7 +26,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from http.client import HTTPException
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Literal
 
 from fusecap.detect.runtimes.choice import SUFFIXES
 from fusecap.errors import InputError, nearest
@@ -55,8 +55,8 @@ class StoredModel:
     licence: str = "Apache-2.0; some data sets it was trained on allow research only"
     package: str = ""
     """What brings a package that holds it."""
-    whole_images: bool = False
-    """It needs no person detector."""
+    finds: Literal["keypoints", "boxes", "people"] = "keypoints"
+    """Keypoints in a person's box, people's boxes, or people's keypoints in whole images."""
 
     @property
     def suffix(self) -> str:
@@ -72,8 +72,15 @@ _WHEEL = "pip download --no-deps --python-version 3.11 --only-binary :all: media
 _NPM = "npm pack @mediapipe/pose@0.5.1675469404"
 
 
-def _blazepose(member: str, sha256: str, about: str, package: str) -> StoredModel:
+def _blazepose(
+    member: str,
+    sha256: str,
+    about: str,
+    package: str,
+    finds: Literal["keypoints", "boxes"] = "keypoints",
+) -> StoredModel:
     return StoredModel(
+        finds=finds,
         url=None,
         member=member,
         sha256=sha256,
@@ -84,16 +91,6 @@ def _blazepose(member: str, sha256: str, about: str, package: str) -> StoredMode
 
 
 MODELS: Mapping[str, StoredModel] = {
-    "rtmpose-t-halpe26": StoredModel(
-        url=_HALPE.format("t", "256x192-6020f8a6_20230605"),
-        sha256=None,
-        about="pose, 26 keypoints, 256x192, fastest",
-    ),
-    "rtmpose-s-halpe26": StoredModel(
-        url=_HALPE.format("s", "256x192-7f134165_20230605"),
-        sha256=None,
-        about="pose, 26 keypoints, 256x192",
-    ),
     "rtmpose-m-halpe26": StoredModel(
         url=_HALPE.format("m", "256x192-4d3e73dd_20230605"),
         # Stated alike by several unrelated public repositories that pin this export.
@@ -105,38 +102,32 @@ MODELS: Mapping[str, StoredModel] = {
         sha256=None,
         about="pose, 26 keypoints, 256x192, slower and better",
     ),
-    "rtmdet-nano-person": StoredModel(
-        url=f"{_OPENMMLAB}/rtmposev1/onnx_sdk/rtmdet_nano_8xb32-100e_coco-obj365-person-05d8511e.zip",
-        # As above.
-        sha256="8297e829ccc5590c8e2d32d5a211f322a0585fb7467eec85eb12c9525b0b95d6",
-        about="people's boxes; the default",
-    ),
-    "yolox-tiny-humanart": StoredModel(
-        url=_YOLOX.format("tiny", "6f3252f9"),
+    "rtmpose-s-halpe26": StoredModel(
+        url=_HALPE.format("s", "256x192-7f134165_20230605"),
         sha256=None,
-        about="people's boxes, 416x416",
+        about="pose, 26 keypoints, 256x192",
     ),
-    "yolox-m-humanart": StoredModel(
-        url=_YOLOX.format("m", "c2c7a14a"),
+    "rtmpose-t-halpe26": StoredModel(
+        url=_HALPE.format("t", "256x192-6020f8a6_20230605"),
         sha256=None,
-        about="people's boxes, 640x640, slower and better",
-    ),
-    "rtmo-s": StoredModel(
-        url=_RTMO.format("s_8xb32", "dac2bf74_20231211"),
-        sha256=None,
-        about="whole images, 17 keypoints, 640x640",
-        whole_images=True,
+        about="pose, 26 keypoints, 256x192, fastest",
     ),
     "rtmo-m": StoredModel(
         url=_RTMO.format("m_16xb16", "39e78cc4_20231211"),
         sha256=None,
         about="whole images, 17 keypoints, 640x640, slower and better",
-        whole_images=True,
+        finds="people",
     ),
-    "blazepose-lite": _blazepose(
-        "pose_landmark_lite.tflite",
-        "f17bfbecadb61c3be1baa8b8d851cc6619c870a87167b32848ad20db306b9d61",
-        "pose, 33 keypoints with heels and toes, 256x256, fastest",
+    "rtmo-s": StoredModel(
+        url=_RTMO.format("s_8xb32", "dac2bf74_20231211"),
+        sha256=None,
+        about="whole images, 17 keypoints, 640x640",
+        finds="people",
+    ),
+    "blazepose-heavy": _blazepose(
+        "pose_landmark_heavy.tflite",
+        "59e42d71bcd44cbdbabc419f0ff76686595fd265419566bd4009ef703ea8e1fe",
+        "pose, 33 keypoints with heels and toes, 256x256, slowest and best",
         _NPM,
     ),
     "blazepose-full": _blazepose(
@@ -145,19 +136,40 @@ MODELS: Mapping[str, StoredModel] = {
         "pose, 33 keypoints with heels and toes, 256x256",
         _WHEEL,
     ),
-    "blazepose-heavy": _blazepose(
-        "pose_landmark_heavy.tflite",
-        "59e42d71bcd44cbdbabc419f0ff76686595fd265419566bd4009ef703ea8e1fe",
-        "pose, 33 keypoints with heels and toes, 256x256, slowest and best",
+    "blazepose-lite": _blazepose(
+        "pose_landmark_lite.tflite",
+        "f17bfbecadb61c3be1baa8b8d851cc6619c870a87167b32848ad20db306b9d61",
+        "pose, 33 keypoints with heels and toes, 256x256, fastest",
         _NPM,
+    ),
+    "rtmdet-nano-person": StoredModel(
+        url=f"{_OPENMMLAB}/rtmposev1/onnx_sdk/rtmdet_nano_8xb32-100e_coco-obj365-person-05d8511e.zip",
+        # As above.
+        sha256="8297e829ccc5590c8e2d32d5a211f322a0585fb7467eec85eb12c9525b0b95d6",
+        about="people's boxes; the default",
+        finds="boxes",
+    ),
+    "yolox-m-humanart": StoredModel(
+        url=_YOLOX.format("m", "c2c7a14a"),
+        sha256=None,
+        about="people's boxes, 640x640, slower and better",
+        finds="boxes",
+    ),
+    "yolox-tiny-humanart": StoredModel(
+        url=_YOLOX.format("tiny", "6f3252f9"),
+        sha256=None,
+        about="people's boxes, 416x416",
+        finds="boxes",
     ),
     "blazepose-person": _blazepose(
         "pose_detection.tflite",
         "9ba9dd3d42efaaba86b4ff0122b06f29c4122e756b329d89dca1e297fd8f866c",
         "people's boxes from their faces: a few metres away",
         _WHEEL,
+        "boxes",
     ),
 }
+"""Of those that find the same, what to take first where several are here comes first."""
 
 
 def cache_dir() -> Path:
@@ -172,6 +184,17 @@ def cache_dir() -> Path:
 def kept_at(model: str, stored: StoredModel, cache: Path | None = None) -> Path:
     """Where its file is or would be."""
     return (cache_dir() if cache is None else cache) / f"{model}{stored.suffix}"
+
+
+def networks_here() -> dict[str, str]:
+    """`model` and `person_model` of `[detector]` by what is kept here; {} where nothing is."""
+    kept = [name for name, stored in MODELS.items() if kept_at(name, stored).is_file()]
+    model = next((name for name in kept if MODELS[name].finds != "boxes"), None)
+    if model is None:
+        return {}
+    boxes = next((name for name in kept if MODELS[name].finds == "boxes"), None)
+    alone = MODELS[model].finds == "people" or boxes is None
+    return {"model": model} if alone else {"model": model, "person_model": str(boxes)}
 
 
 def to_download(model: str) -> StoredModel | None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
+from types import MappingProxyType
 
 from fusecap.body.skeleton import Skeleton, skeleton_named
 from fusecap.errors import InputError
@@ -14,8 +15,11 @@ from fusecap.sources.video import probe
 SKELETON = "paper21"
 
 
-def draft(found: FolderSurvey) -> str:
-    """The text of the file; raises `InputError` for a folder without a recording."""
+def draft(found: FolderSurvey, networks: Mapping[str, str] = MappingProxyType({})) -> str:
+    """The text of the file; raises `InputError` for a folder without a recording.
+
+    `networks`: keys of `[detector]`, for videos without keypoints.
+    """
     if found.nothing:
         raise InputError(
             f"{found.folder}: no video, no keypoint folder and no sensor file; put the recording "
@@ -32,6 +36,9 @@ def draft(found: FolderSurvey) -> str:
             '# calibration = "calibration.toml"',
         ]
     lines += _rate(found)
+    if networks and {path.stem for path in found.videos} - {*found.keypoints}:
+        lines += ["", "[detector]   # what is on this machine: fusecap models list"]
+        lines += [f"{key} = {quoted(name)}" for key, name in networks.items()]
     return "\n".join([*lines, *_cameras(found), *_subject(found)]) + "\n"
 
 
