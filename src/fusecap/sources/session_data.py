@@ -69,6 +69,8 @@ class SubjectImus:
 
     def __init__(self, subject: str, imus: Sequence[MountedImu], times_s: np.ndarray) -> None:
         self.subject = subject
+        self.bones = tuple(imu.bone for imu in imus)
+        """Which of them carries each sensor."""
         self._imus = imus
         self._times_s = times_s
         self._block = -1

@@ -48,7 +48,7 @@ def resting_imu(track: ImuTrack, *, axes: str, imu_up: str = "z") -> RestingImu:
     measure gravity.
     """
     body_from_imu = _axes(axes)
-    accel = track.accel_m_s2[np.isfinite(track.accel_m_s2[:, 0])]
+    accel = track.accel_m_s2[np.isfinite(track.accel_m_s2[:, 0])].astype(np.float64)
     if len(accel) < 10:
         raise InputError(
             f"{len(accel)} samples have an acceleration, expected a second of them or more; export "

@@ -248,7 +248,7 @@ def _stamp(
         ankle = take.bone_position_in_world_m[index, :, take.bone_names.index(f"{side}_foot")]
         feet[side] = (take.time_s, np.where(take.tracked[index][:, None], ankle, np.nan))
     forces = [
-        (imu.bone, track.times_s, track.accel_m_s2)
+        (imu.bone, track.times_s, track.accel_m_s2.astype(np.float64))
         for imu, track in zip(subject.imus, tracks, strict=True)
         if imu.bone.endswith(("_foot", "_shank"))
     ]

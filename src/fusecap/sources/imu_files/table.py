@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import codecs
 import csv
+import itertools
+from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -74,41 +76,37 @@ def read_table(path: Path, *first_columns: str) -> ImuTable:
             "check that the file is of the stated format"
         )
     delimiter = max("\t,;", key=lines[index].count)
-    columns = tuple(cell.strip() for cell in _cells(lines[index : index + 1], delimiter)[0])
-    body = _cells([line for line in lines[index + 1 :] if line.strip()], delimiter)
-    if delimiter == ",":
-        _refuse_decimal_comma(path, columns, body)
-    rows = [_numbers(cells, len(columns)) for cells in body]
-    first = next((i for i, row in enumerate(rows) if np.isfinite(row).any()), 0)
-    if first >= len(rows) or not rows:
+    (head,) = csv.reader(lines[index : index + 1], delimiter=delimiter)
+    columns = tuple(cell.strip() for cell in head)
+    body = (line for line in itertools.islice(lines, index + 1, None) if line.strip())
+    values, units = array("d"), ()
+    count, doubled, first_doubled = 0, 0, []
+    for cells in csv.reader(body, delimiter=delimiter):
+        count += 1
+        if len(cells) > 1.5 * len(columns):
+            doubled += 1
+            first_doubled = first_doubled or cells
+        numbers = [number(cell) for cell in cells[: len(columns)]]
+        if not values and not np.isfinite(numbers).any():
+            units = tuple(cells)
+            continue
+        values.extend(numbers + [float("nan")] * (len(columns) - len(numbers)))
+    if delimiter == "," and doubled > count / 2:
+        # Commas between cells and in numbers double the cells of most lines.
+        raise InputError(
+            f"{path}: lines have {len(first_doubled)} cells under {len(columns)} columns, from "
+            f"'{','.join(first_doubled[:2])}' on: the decimal sign is a comma, as is what stands "
+            "between cells; export with a decimal point, or with semicolons or tabs between cells"
+        )
+    if not values:
         raise InputError(f"{path}: no samples below the header; export the recording again")
     return ImuTable(
         path=path,
         preamble=tuple(lines[:index]),
         columns=columns,
-        units=tuple(body[first - 1]) if first else (),
-        rows=np.array(rows[first:]),
+        units=units,
+        rows=np.frombuffer(values).reshape(-1, len(columns)),
     )
-
-
-def _cells(lines: list[str], delimiter: str) -> list[list[str]]:
-    return list(csv.reader(lines, delimiter=delimiter))
-
-
-def _refuse_decimal_comma(path: Path, columns: Sequence[str], body: list[list[str]]) -> None:
-    """Commas between cells and in numbers double the cells of most lines."""
-    doubled = [cells for cells in body if len(cells) > 1.5 * len(columns)]
-    if len(doubled) > len(body) / 2:
-        raise InputError(
-            f"{path}: lines have {len(doubled[0])} cells under {len(columns)} columns, from "
-            f"'{','.join(doubled[0][:2])}' on: the decimal sign is a comma, as is what stands "
-            "between cells; export with a decimal point, or with semicolons or tabs between cells"
-        )
-
-
-def _numbers(cells: list[str], count: int) -> list[float]:
-    values = [number(cell) for cell in cells[:count]]
-    return values + [float("nan")] * (count - len(values))
 
 
 def number(cell: str) -> float:

@@ -40,9 +40,9 @@ class ImuTrack:
     times_s: np.ndarray
     """(N,) strictly ascending, on the file's clock."""
     orientation_wxyz: np.ndarray
-    """(N, 4) imu_world_from_imu, unit."""
+    """(N, 4) imu_world_from_imu, unit; of a file float32, a hundred thousandth of a degree."""
     accel_m_s2: np.ndarray
-    """(N, 3) specific force in the imu frame; NaN where not measured."""
+    """(N, 3) specific force in the imu frame; NaN where not measured; of a file float32."""
     notes: tuple[str, ...] = ()
     """What was wrong with the file and has been dealt with."""
     clock: SharedClock | None = None
@@ -107,8 +107,8 @@ def tidy(
     measured = np.all(np.isfinite(accel), axis=1, keepdims=True)
     return ImuTrack(
         times_s=times_s,
-        orientation_wxyz=quaternion,
-        accel_m_s2=np.where(measured, accel, np.nan),
+        orientation_wxyz=quaternion.astype(np.float32),
+        accel_m_s2=np.where(measured, accel, np.nan).astype(np.float32),
         notes=tuple(said),
         clock=clock,
         heading_known=heading_known,
