@@ -1,13 +1,14 @@
 """Leg angles of real walks against Vicon: raw, and after one constant per angle.
 
 uv run python benchmarks/angles_real.py gait DATA/gait_imu_vicon
-uv run python benchmarks/angles_real.py walker SESSION [--solve cameras_only.toml]
+uv run python benchmarks/angles_real.py walker SESSION
 
 `gait`: seven sensors, no camera, the sensors calibrated by Vicon's first half second; later frames
 are scored. `walker`: a session of the KAM recordings with their `truth.npz` (the folder that
-`walker1.tar.xz` holds), after `fusecap calibrate imu SESSION --write`. Its segments are known up to
-a constant rotation, which is taken from the solve itself, and it has no pelvis and no feet: only
-knees are scored, and there is no raw difference.
+`walker1.tar.xz` holds), after `fusecap calibrate imu SESSION --write`; solved from cameras, from
+sensors and from both. Its segments are known up to a constant rotation, which is taken from the
+solve itself, and it has no pelvis and no feet: only thighs, shanks and knees are scored, and there
+is no raw difference.
 """
 
 from __future__ import annotations
@@ -38,7 +39,8 @@ def gait(folder: Path) -> None:
     """IMUs alone; frames after the calibration, to Vicon's last."""
     example = script("gait_imu_only")
     with tempfile.TemporaryDirectory() as out:
-        take = solved(example.write_session(folder, Path(out)))
+        session = load_session(example.write_session(folder, Path(out)))
+        take = solve_session(open_session(session), anyway=True).take
     vicon = example.read_vicon(folder / "vicon_first_400.csv").rotation
     first, end = example.CALIBRATION_FRAMES, len(vicon["hips"])
     take = take.of_frames(first, end)
@@ -47,10 +49,23 @@ def gait(folder: Path) -> None:
     table(take, truth, LEG, raw=True)
 
 
-def walker(folder: Path, file: str) -> None:
-    """Knees of the treadmill walker."""
-    take = solved(folder / file)
+def walker(folder: Path) -> None:
+    """The treadmill walker from cameras, from sensors and from both."""
+    session = load_session(folder)
+    bare = tuple(one.model_copy(update={"imus": ()}) for one in session.subjects)
+    for name, measured in (
+        ("cameras", session.model_copy(update={"subjects": bare})),
+        ("sensors", session.model_copy(update={"cameras": ()})),
+        ("both", session),
+    ):
+        score_walker(name, solve_session(open_session(measured), anyway=True).take, folder)
+
+
+def score_walker(name: str, take: Take, folder: Path) -> None:
+    """Segments and knees, and how the right foot trembles."""
     take = take.of_subjects([int(np.argmax(take.tracked.sum(axis=1)))])
+    foot = take.bone_position_in_world_m[0, :, take.bone_names.index("right_foot")]
+    third = np.linalg.norm(np.diff(foot, 3, axis=0), axis=1) * take.rate_hz**3
     known = np.load(folder / "truth.npz")
     time_s = take.time_s
     nearest = np.abs(time_s[None] - known["time_s"][:, None]).argmin(axis=1)
@@ -60,12 +75,16 @@ def walker(folder: Path, file: str) -> None:
     there &= np.all([np.isfinite(known[f"R_{bone}"]).all(axis=(1, 2)) for bone in bones], axis=0)
     frames, rows = np.unique(nearest[there], return_index=True)
     take = at_frames(take, frames)
-    turns = {}
+    turns, away = {}, {}
     for bone in bones:
         segment = Rotation.from_matrix(Y_UP_FROM_Z_UP @ known[f"R_{bone}"][there][rows])
         ours = Rotation.from_matrix(take.bone_rotation_in_world(0)[:, take.bone_names.index(bone)])
         turns[bone] = segment * (segment.inv() * ours).mean()
-    print(f"{folder.name}, {file}, {len(frames)} frames, one constant rotation per segment")
+        away[bone] = np.degrees((turns[bone].inv() * ours).magnitude()).mean()
+    told = ", ".join(f"{bone} {deg:.1f}" for bone, deg in away.items())
+    print(f"\n{folder.name}, {name}, {len(frames)} frames, one constant rotation per segment")
+    print(f"segments deg: {told}; mean {np.mean(list(away.values())):.1f}")
+    print(f"right foot's jitter: {1e-3 * np.nanmean(third):.2f} km/s³")
     table(take, with_bones(take, turns), ("knee_flexion",), raw=False)
 
 
@@ -104,10 +123,6 @@ def at_frames(take: Take, frames: np.ndarray) -> Take:
     )
 
 
-def solved(path: Path) -> Take:
-    return solve_session(open_session(load_session(path)), anyway=True).take
-
-
 def script(name: str) -> ModuleType:
     path = Path(__file__).resolve().parents[1] / "examples" / f"{name}.py"
     spec = importlib.util.spec_from_file_location(name, path)
@@ -122,12 +137,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("what", choices=("gait", "walker"))
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--solve", default="session.toml", help="Of the walker: which session.")
     arguments = parser.parse_args()
     if arguments.what == "gait":
         gait(arguments.folder)
     else:
-        walker(arguments.folder, arguments.solve)
+        walker(arguments.folder)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,8 @@
 Simulated twin, two training sequences, 4 cameras, solved at 60 Hz. Each camera exposes at an
 offset of its own. *Between*: keypoints are interpolated to the instants, as everywhere in fusecap.
 *Own*: a frame counts at the instant nearest to it and at no other, all others go without that
-camera. Prints the newest pose and the take: position from the root [mm], orientation [deg].
+camera. *Heavier*: the same, a keypoint weighing as much as the instants to which it would have been
+interpolated. Prints of the take: position from the root [mm], orientation [deg].
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import numpy as np
 from fusecap.body.landmarks import landmark_set_named
 from fusecap.evaluate.imu_noise import IMUS_6, IMUS_13
 from fusecap.evaluate.score import score_take
-from fusecap.evaluate.simulated_solve import live_takes, solve_simulation
+from fusecap.evaluate.simulated_solve import solve_simulation
 from fusecap.evaluate.simulator import CameraTiming, Person, Simulation, camera_ring, simulate
 from fusecap.evaluate.twin import (
     LANDMARK_SET,
@@ -28,7 +29,7 @@ from fusecap.evaluate.twin import (
     TwinSequence,
     twin_training_sequences,
 )
-from fusecap.take import Take
+from fusecap.solve.options import SolverOptions, Weights
 from fusecap.types import Detections
 
 SEQUENCES = ("T1 FS1", "T3 FS1")
@@ -39,15 +40,17 @@ CAMERAS = 4
 
 def main() -> None:
     sequences = [s for s in twin_training_sequences() if s.key in SEQUENCES]
-    print("sensors    rate Hz   between: newest       take           own: newest       take")
+    print("sensors    rate Hz   between            own               own, heavier")
     for name, bones in SENSORS.items():
         for rate_hz in RATES_HZ:
             errors = []
             for sequence in sequences:
-                simulation = captured(sequence, bones, rate_hz)
-                errors.append([*scores(simulation), *scores(at_own_times(simulation))])
+                between = captured(sequence, bones, rate_hz)
+                own = at_own_times(between)
+                heavier = sequence.rate_hz / rate_hz
+                errors.append([scores(between), scores(own), scores(own, heavier)])
             mean = np.mean(errors, axis=0)
-            cells = "   ".join(f"{mm:5.1f} {deg:5.2f} deg" for mm, deg in mean.reshape(-1, 2))
+            cells = "   ".join(f"{mm:5.1f} {deg:5.2f} deg" for mm, deg in mean)
             print(f"{name:8} {rate_hz:6.0f}    {cells}", flush=True)
 
 
@@ -90,16 +93,10 @@ def at_own_times(simulation: Simulation) -> Simulation:
     return own
 
 
-def scores(simulation: Simulation) -> list[float]:
-    newest, _ = live_takes(simulation, lag_s=0.1)
-    return [
-        *error(newest, simulation.truth),
-        *error(solve_simulation(simulation).take, simulation.truth),
-    ]
-
-
-def error(take: Take, truth: Take) -> tuple[float, float]:
-    score = score_take(take, truth, gate_m=np.inf)
+def scores(simulation: Simulation, heavier: float = 1.0) -> tuple[float, float]:
+    weights = Weights(position=heavier * Weights().position)
+    take = solve_simulation(simulation, options=SolverOptions(weights=weights)).take
+    score = score_take(take, simulation.truth, gate_m=np.inf)
     return score.root_relative_error_mm.mean, score.orientation_error_deg.mean
 
 
