@@ -16,6 +16,11 @@ from fusecap.take import save_take
 from motions import person
 from test_retarget_character import character_file, in_armature, world_of
 
+PANEL = [
+    *("import_anim.fusecap_take", "fusecap_address", "fusecap_record"),
+    *("scene.fusecap_connect", "scene.fusecap_disconnect", "object.fusecap_retarget"),
+    "import_anim.fusecap_take",
+]
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -56,6 +61,11 @@ def streaming(take: Path):
 @pytest.mark.slow
 def test_takes_and_streams_become_armatures_that_move_and_move_characters(tmp_path, extension):
     python = environment("FUSECAP_BPY_PYTHON", "bpy")
+    (archive,) = tmp_path.glob("*.zip")
+    scripts = "import bpy; print(bpy.utils.system_resource('SCRIPTS'))"
+    told = subprocess.run([python, "-c", scripts], capture_output=True, text=True, check=True)
+    checker = Path(told.stdout.splitlines()[-1]) / "addons_core/bl_pkg/cli/blender_ext.py"
+    subprocess.run([python, checker, "validate", archive], check=True)
     take = with_gap(two_walkers(60, names=("anna", "Zoë/2")), [20, 21])
     save_take(take, tmp_path / "t.npz")
     out = tmp_path / "out.npz"
@@ -67,6 +77,7 @@ def test_takes_and_streams_become_armatures_that_move_and_move_characters(tmp_pa
             python, "blender_extension.py", extension, tmp_path / "t.npz", out, address, *characters
         )
     assert told["people"] == 3
+    assert told["drawn"] == PANEL
     with np.load(out) as found:
         tracked_first = take.tracked[0]
         for row, name in enumerate(take.subject_names):

@@ -162,6 +162,15 @@ def in_armature(source, target) -> Path:
             joint["rotation"] = inside.as_quat().tolist()
         joint["translation"] = place.tolist()
     Gltf(tree, read.binary).write(target)
+    inside, gltf = read_character(target), Gltf(tree, read.binary)
+    (skin,) = tree["skins"]
+    binds = np.tile(np.eye(4), (len(skin["joints"]), 1, 1))
+    for bind, node in zip(binds, skin["joints"], strict=True):
+        bind[:3, :3] = inside.world_scale[node] * inside.world_rotation[node]
+        bind[:3, 3] = inside.world_position_m[node]
+    columns = np.linalg.inv(binds).transpose(0, 2, 1).reshape(-1, 16)
+    skin["inverseBindMatrices"] = gltf.array(columns.astype(np.float32))
+    gltf.write(target)
     return target
 
 
@@ -186,6 +195,38 @@ def test_names_of_many_programs_are_guessed(tmp_path, names):
     read = read_character(avatar)
     found = bone_map(read, {}).bones
     assert {bone: read.names[found[bone]] for bone in ours} == ours
+
+
+METARIG = {
+    **{"hips": "spine", "spine": "spine.001", "spine1": "spine.002", "spine2": "spine.003"},
+    **{"spine3": "spine.004", "neck": "spine.005", "head": "spine.006", "left_thigh": "thigh.L"},
+}
+
+
+def test_trunks_without_names_are_told_by_where_they_are(tmp_path):
+    """Rigify's metarig calls hips, neck and head spine."""
+    avatar = character_file(tmp_path / "a.glb", rename=lambda name: METARIG.get(name, name))
+    read = read_character(avatar)
+    found = bone_map(read, {})
+    told = {bone: read.names[found.bones[bone]] for bone in ("hips", "neck", "head")}
+    assert told == {"hips": "spine", "neck": "spine.005", "head": "spine.006"}
+    assert [read.names[n] for n in found.spine] == [f"spine.00{n}" for n in (1, 2, 3, 4)]
+
+
+def test_limbs_that_do_not_hang_on_the_hips_are_named(tmp_path):
+    """As the deforming bones of a rig with controls, whose widgets are of odd sizes besides."""
+    read = read_character(character_file(tmp_path / "c.glb", rig="vrm"))
+    tree = copy.deepcopy(read.tree)
+    tree["nodes"].append({"name": "WGT-eye", "scale": [-0.03, 0.03, 0.05]})
+    Gltf(tree, read.binary).write(tmp_path / "widget.glb")
+    take = two_walkers(3).of_subjects([0])
+    fusecap.retarget(take, tmp_path / "widget.glb", tmp_path / "out.glb")
+    leg = read.names.index("leftUpperLeg")
+    tree["nodes"][read.names.index("hips")]["children"].remove(leg)
+    tree["nodes"][read.names.index("armature")]["children"].append(leg)
+    Gltf(tree, read.binary).write(tmp_path / "loose.glb")
+    with pytest.raises(InputError, match=r"hips \(hips\): left_thigh \(leftUpperLeg\), left_shank"):
+        fusecap.retarget(take, tmp_path / "loose.glb", tmp_path / "out.glb")
 
 
 def test_a_vrm_s_own_map_counts(tmp_path):
@@ -227,7 +268,7 @@ def test_broken_characters_are_one_line(tmp_path):
         with pytest.raises(InputError):
             fusecap.retarget(take, broken, out)
     tree = copy.deepcopy(read_character(avatar).tree)
-    tree["nodes"][0]["scale"] = [1, 2, 1]
+    tree["nodes"][read_character(avatar).joints[0]]["scale"] = [1, 2, 1]
     Gltf(tree, read_character(avatar).binary).write(broken)
     for where, message in (
         (tmp_path / "no.glb", "no such file"),

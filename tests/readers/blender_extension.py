@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 import sys
 import time
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
@@ -50,6 +51,30 @@ def retarget(person, character) -> None:
     assert bpy.ops.object.fusecap_retarget() == {"FINISHED"}
 
 
+class Layout:
+    """Stands where Blender gives a panel its layout; what is drawn must exist."""
+
+    def __init__(self) -> None:
+        self.drawn: list[str] = []
+
+    def operator(self, name: str, **options: object) -> None:
+        group, _, operator = name.partition(".")
+        assert getattr(getattr(bpy.ops, group), operator).get_rna_type().name
+        self.drawn.append(name)
+
+    def prop(self, owner, name: str, **options: object) -> None:
+        assert owner.bl_rna.properties[name].name
+        self.drawn.append(name)
+
+
+def draw(extension) -> list[str]:
+    """What the panel and the import menu show."""
+    here = SimpleNamespace(layout=Layout())
+    extension.VIEW3D_PT_fusecap.draw(here, bpy.context)
+    extension._menu(here, bpy.context)
+    return here.layout.drawn
+
+
 def main() -> None:
     folder, take, out, address, *characters = sys.argv[1:]
     sys.path.insert(0, folder)
@@ -58,6 +83,7 @@ def main() -> None:
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.context.scene.render.fps = 60
     fusecap_motion.register()
+    drawn = draw(fusecap_motion)
     with np.load(take) as file:
         frames = len(file["timestamps_ns"])
     assert bpy.ops.import_anim.fusecap_take(filepath=take) == {"FINISHED"}
@@ -90,7 +116,7 @@ def main() -> None:
         found[kind] = heads(armature, 1, int(length))
     fusecap_motion.unregister()
     np.savez(out, **found)
-    print(json.dumps({"blender": bpy.app.version_string, "people": len(people())}))
+    print(json.dumps({"blender": bpy.app.version_string, "people": len(people()), "drawn": drawn}))
 
 
 if __name__ == "__main__":

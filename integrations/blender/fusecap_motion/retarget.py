@@ -1,15 +1,17 @@
 """A person's motion on the rig of a character: same directions, own proportions, feet that stand.
 
-As `fusecap retarget` does it (docs/characters.md), for armatures of the scene. Rest poses are
-brought together first: the person is turned to face as the character does, and each limb is laid
-along the character's. Then bones turn in the world as the person's do, the way through the room is
-scaled as legs are, and legs reach for where the person's ankles belong.
+As `fusecap retarget` does it (docs/characters.md), for armatures of the scene, with NumPy and
+mathutils alone: Blender has neither SciPy nor fusecap, and z is up here. A test holds the two
+within a millimetre of each other. Rest poses are brought together first: the person is turned to
+face as the character does, and each limb is laid along the character's. Then bones turn in the
+world as the person's do, the way through the room is scaled as legs are, and legs reach for where
+the person's ankles belong.
 """
 
 import bpy
 import numpy as np
 
-from .bone_words import NEEDED, guess_bones, spine_of, spine_shares
+from .bone_words import NEEDED, guess_bones, loose_bones, spine_of, spine_shares
 from .skeleton import bake_channels, matrices, quaternions
 
 _CHILD = {
@@ -102,6 +104,14 @@ class Follower:
             raise ValueError(
                 f"{self.object.name}: cannot tell which bone is {', '.join(missing)}; "
                 f"say it: {missing[0]}=NAME"
+            )
+        loose = loose_bones(found, self._parents)
+        if loose:
+            named = ", ".join(f"{bone} ({self.names[found[bone]]})" for bone in loose)
+            raise ValueError(
+                f"{self.object.name}: these do not hang on the hips ({self.names[found['hips']]}): "
+                f"{named}; name the right ones, or take the rig that its controls were made from "
+                "(Rigify's metarig)"
             )
         if self.object.data.bones[self.names[found["hips"]]].use_connect:
             raise ValueError(
@@ -201,8 +211,6 @@ class Follower:
         if bone == self._hips:
             return hips_m
         parent = self._parents[bone]
-        if parent < 0:
-            raise ValueError(f"{self.object.name}: '{self.names[bone]}' does not hang on its hips")
         away = self._rest_turn[parent].T @ (self._rest_m[bone] - self._rest_m[parent])
         above = self._turn_of(parent, turns, len(hips_m))
         return self._place(parent, turns, hips_m) + above @ away

@@ -4,12 +4,15 @@ import numpy as np
 
 from .skeleton import Person
 
+_FORMAT = "fusecap take 2"
+
 
 def import_take(path, rate_hz):
     """Armatures with an action each; frames of a scene of `rate_hz`. Raises ValueError, OSError."""
     with np.load(path, allow_pickle=False) as file:
-        if not str(file["format"] if "format" in file.files else "").startswith("fusecap take"):
-            raise ValueError("this .npz is not a take of fusecap")
+        found = str(file["format"] if "format" in file.files else "")
+        if found != _FORMAT:
+            raise ValueError(f"expected a '{_FORMAT}', found {found or 'another kind of .npz'}")
         take = {name: file[name] for name in file.files}
     time_s = (take["timestamps_ns"] - take["timestamps_ns"][:1]) * 1e-9
     people = []

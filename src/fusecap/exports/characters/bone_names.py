@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from fusecap.body.rigs import PRESETS
 from fusecap.errors import InputError, nearest
-from fusecap.exports.characters.bone_words import NEEDED, guess_bones, spine_of
+from fusecap.exports.characters.bone_words import NEEDED, guess_bones, loose_bones, spine_of
 from fusecap.exports.characters.character import Character
 
 
@@ -40,6 +40,14 @@ def bone_map(character: Character, by_hand: Mapping[str, str]) -> BoneMap:
         raise InputError(
             f"{character.path}: cannot tell which bone is {', '.join(missing)} (found: {pairs}); "
             f"say it: --map {missing[0]}=NAME"
+        )
+    loose = loose_bones(found, character.parents)
+    if loose:
+        named = ", ".join(f"{bone} ({character.names[found[bone]]})" for bone in loose)
+        raise InputError(
+            f"{character.path}: these do not hang on the hips ({character.names[found['hips']]}): "
+            f"{named}; name the right ones with --map, or take the rig that its controls were made "
+            "from (Rigify's metarig)"
         )
     return BoneMap(bones=found, spine=spine_of(found, character.parents))
 

@@ -1,7 +1,9 @@
 """Which bones of a character are which of ours, by their names alone.
 
 A name is cut into words (`mixamorig:LeftForeArm` is mixamorig, left, fore, arm), a word for the
-side is taken out, what all names begin with is left away, and the rest is looked up.
+side is taken out, what all names begin with is left away, and the rest is looked up. Hips without a
+name that says so are where the thighs meet; of joints called spine, those above the arms are necks,
+the last one the head (Rigify's metarig is spine, spine.001, ... spine.006).
 
 The Blender extension has this module too: it imports Python's own library alone.
 """
@@ -81,7 +83,18 @@ def guess_bones(names: Mapping[int, str], parents: Sequence[int]) -> dict[str, i
         found.setdefault(f"{sides[0]}_{kind}" if sides else kind, joint)
     for side in ("left", "right"):
         _take_shoulder_for_arm(words, parents, found, side)
+    thighs = [_up_from(found.get(f"{side}_thigh", -1), parents) for side in ("left", "right")]
+    for joint in thighs[0]:
+        if "hips" not in found and joint in thighs[1] and joint in names:
+            found["hips"] = joint
+    if not {"neck", "head"} & {*found} and "left_upper_arm" in found:
+        _take_spines_for_neck(words, parents, found)
     return found
+
+
+def loose_bones(found: Mapping[str, int], parents: Sequence[int]) -> list[str]:
+    """Of those that are needed, the ones that do not hang on the hips."""
+    return [b for b in NEEDED if b != "hips" and found["hips"] not in _up_from(found[b], parents)]
 
 
 def spine_of(found: Mapping[str, int], parents: Sequence[int]) -> tuple[int, ...]:
@@ -106,6 +119,32 @@ def spine_shares(count: int) -> list[tuple[str, str, float]]:
         below = ours[max(low - 1, 0)]
         shares.append((below, ours[low] if low else below, at - low if low else 0.0))
     return shares
+
+
+def _up_from(joint: int, parents: Sequence[int]) -> list[int]:
+    """What a joint hangs on, the nearest first."""
+    chain = []
+    while joint >= 0 and parents[joint] >= 0:
+        joint = parents[joint]
+        chain.append(joint)
+    return chain
+
+
+def _take_spines_for_neck(
+    words: Mapping[int, list[str]], parents: Sequence[int], found: dict[str, int]
+) -> None:
+    above_arm, hips = _up_from(found["left_upper_arm"], parents), found.get("hips")
+    line = [
+        joint
+        for joint, named in words.items()
+        if [word for word in named if not word.isdigit()][-1:] == ["spine"]
+        and joint not in above_arm
+        and hips in _up_from(joint, parents)
+    ]
+    if line:
+        found["head"] = line[-1]
+    if len(line) > 1:
+        found["neck"] = line[0]
 
 
 def _take_shoulder_for_arm(

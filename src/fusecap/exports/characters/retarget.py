@@ -212,11 +212,6 @@ class _Moved:
         if node == self.hips:
             return self._hips_m
         character, above = self._character, self._character.parents[node]
-        if above < 0:
-            raise InputError(
-                f"{character.path}: '{character.names[node]}' does not hang on the hips "
-                f"('{character.names[self._bones['hips']]}'); name the right ones with --map"
-            )
         away = character.world_scale[above] * character.position_m[node]
         return self._place_m(above) + self._turn_of(above) @ away
 
