@@ -49,6 +49,15 @@ def walker(
     height_m: float = 1.75,
 ) -> np.ndarray:
     """Landmarks (t, k, 3) of somebody on `path(times) -> x, z, heading`, swinging arms and legs."""
+    return walker_with_turns(path, times_s, height_m)[0]
+
+
+def walker_with_turns(
+    path: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]],
+    times_s: np.ndarray,
+    height_m: float = 1.75,
+) -> tuple[np.ndarray, np.ndarray]:
+    """A `walker`, and how its bones are turned in the world (t, b, 3, 3)."""
     shape = BodyShape.from_height(PAPER21, height_m)
     theta = np.zeros((len(times_s), PAPER21.pose_size))
     x, z, heading = path(times_s)
@@ -68,7 +77,8 @@ def walker(
     turn("left_forearm", 1, -0.6 + 0.4 * swing)
     turn("right_forearm", 1, 0.6 + 0.4 * swing)
     position, rotation = forward_kinematics(shape, theta)
-    return landmarks_in_world(position, rotation, BODY25.bones(PAPER21), BODY25.offsets_m(shape))
+    bones, offsets = BODY25.bones(PAPER21), BODY25.offsets_m(shape)
+    return landmarks_in_world(position, rotation, bones, offsets), rotation
 
 
 def straight(start: tuple[float, float], velocity: tuple[float, float]):

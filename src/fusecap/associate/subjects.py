@@ -260,6 +260,8 @@ class Cast:
                 place.start_m = None
         newcomers = [t for t in tracks if t.track_id not in subjects and self._may_enter(t, now_ns)]
         self.kept_out, self.undecided = [], []
+        gone = [p for p in self._places if p.track and not p.live and p.name in vote.heard]
+        newcomers, _ = self._admit_wearers(newcomers, gone, tracks, now_ns, vote)
         known = [p for p in self._places if p.track or p.start_m]
         away = self._by_clothes(newcomers, known, now_ns, vote)
         self.undecided = [
@@ -322,7 +324,7 @@ class Cast:
                 self._admit_to(worn[w], newcomers[n], tracks)
                 named.add(n)
         waiting = [p for p in waiting if not p.live]
-        undisputed = len(tracks) == 1 or all(p.live for p in worn)
+        undisputed = len(tracks) == len(worn) == 1 or all(p.live for p in worn)
         left = [
             t
             for n, t in enumerate(newcomers)
