@@ -79,6 +79,9 @@ class Step:
     the one that they have."""
     renumbered_since_ns: int | None = None
     """When these went astray; None where sensors' readings must tell."""
+    returned: Mapping[int, tuple[int, int]] = field(default_factory=dict)
+    """Of newcomers who turned out to be subjects that nobody saw: by the track id they had, the
+    subject's, and when they were first seen [ns]."""
     found_anew: Mapping[str, int] = field(default_factory=dict)
     """By name, whose pose did not fit and was found anew, and since when [ns] it was wrong."""
     bystanders: tuple[TrackUpdate, ...] = ()
@@ -201,6 +204,7 @@ class Pipeline:
             estimates=tuple(estimate for estimate in results if estimate is not None),
             renumbered=tracker.renumbered if tracker else {},
             renumbered_since_ns=tracker.renumbered_since_ns if tracker else None,
+            returned=dict(tracker.returned) if tracker else {},
             found_anew=found_anew,
             bystanders=tuple(tracker.bystanders) if tracker else (),
             notes=tuple(tracker.notes) if tracker else (),
@@ -311,9 +315,12 @@ class Pipeline:
                 self._sorter.hear(readings)
             updates = self._sorter.update(detections, predicted, detections.timestamp_ns)
             if isinstance(self._sorter, Tracker):
+                back = {number for number, _ in self._sorter.returned.values()}
                 for update in updates:
                     if update.track_id in self._sorter.renumbered.values():
                         self._estimators.pop(update.name, None)
+                    elif update.track_id in back and update.name in self._estimators:
+                        self._estimators[update.name].restart()
         sorted_names = {update.name for update in updates}
         if self._looked_ns is None or detections.looked is None or any(detections.looked):
             self._looked_ns = detections.timestamp_ns

@@ -72,6 +72,8 @@ class Cast:
         """Who is established and has no place while a subject is missing."""
         self.undecided: list[Track] = []
         """Who may be a missing subject, and has not been seen alone yet."""
+        self.returned: dict[int, tuple[int, int]] = {}
+        """At this instant, by the id a newcomer had, whose it has, and when it was born [ns]."""
         self._single = len(rig) == 1
         self.size = options.max_subjects or len(subjects) or sys.maxsize
         """Subjects there may be at most."""
@@ -259,8 +261,8 @@ class Cast:
             if place.name in vote.heard and (now_ns - self._begun_ns) * 1e-9 > o.patience_s:
                 place.start_m = None
         newcomers = [t for t in tracks if t.track_id not in subjects and self._may_enter(t, now_ns)]
-        self.kept_out, self.undecided = [], []
-        gone = [p for p in self._places if p.track and not p.live and p.name in vote.heard]
+        self.kept_out, self.undecided, self.returned = [], [], {}
+        gone = [p for p in self._places if p.name in vote.heard and self._is_away(p, now_ns)]
         newcomers, _ = self._admit_wearers(newcomers, gone, tracks, now_ns, vote)
         known = [p for p in self._places if p.track or p.start_m]
         away = self._by_clothes(newcomers, known, now_ns, vote)
@@ -399,9 +401,15 @@ class Cast:
         return float(away / reach + misfit / o.size_tolerance)
 
     @staticmethod
-    def _admit_to(place: Place, track: Track, everyone: Sequence[Track]) -> None:
+    def _is_away(place: Place, now_ns: int) -> bool:
+        """Whether a subject is missing, or will be unless somebody sees it again."""
+        track = place.track
+        return track is not None and (not place.live or now_ns - track.seen_ns > SOON_S * 1e9)
+
+    def _admit_to(self, place: Place, track: Track, everyone: Sequence[Track]) -> None:
         """A place that was live is handed over: nobody follows there whom it had any more."""
         if place.track is not None:
+            self.returned[track.track_id] = (place.track.track_id, track.born_ns)
             if place.live:
                 place.track.replaced = True
             track.becomes(place.track, everyone)

@@ -167,6 +167,11 @@ class Tracker:
 
     # ---------------------------------------------------------------------------------------- cast
 
+    @property
+    def returned(self) -> dict[int, tuple[int, int]]:
+        """Who at the last instant turned out to be a subject; see `Step.returned`."""
+        return self._cast.returned
+
     def reinitialise(self, name: str = "") -> None:
         """Forget a subject's track, body and start position, so that it is found anew anywhere.
 

@@ -85,7 +85,7 @@ def _sort(
         step = pipeline.step(instants.detections(instant), instants.readings(instant))
         assigned.add([*step.updates, *step.bystanders], step.estimates)
         notes += [f"{instant / setup.rate_hz:.2f} s: {note}" for note in step.notes]
-        moved += [(instant, step)] if step.renumbered or step.found_anew else []
+        moved += [(instant, step)] if step.renumbered or step.returned or step.found_anew else []
         for name in step.found_anew:
             found_anew.setdefault(name, []).append(instant / setup.rate_hz)
         if progress:
@@ -99,6 +99,9 @@ def _sort(
                 since = _first_instant(instants, instant, step.found_anew[name])
                 for row in range(since, instant):
                     assigned.unseed(row, track_id)
+        for former, (number, since_ns) in step.returned.items():
+            for row in range(_first_instant(instants, instant, since_ns), instant):
+                assigned.renumber(row, {former: number, number: former})
         if not step.renumbered:
             continue
         wearers = {i: names[i] for i in step.renumbered.values() if i in names}

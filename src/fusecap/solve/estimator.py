@@ -158,13 +158,17 @@ class Estimator:
         away_ns = checked_moment(observation.timestamp_ns, self._last_ns) - self._last_ns
         self.track_id = track_id
         if self._solution is not None and away_ns > _RESTART_AFTER_NS:
-            self._solution = None
-            self._previous = None
-            self._sites = []
-            self._points = []
-            self._watchdog.reset()
-            self._begin_motion()
+            self.restart()
         return self.update(observation, landmarks_in_world_m)
+
+    def restart(self) -> None:
+        """The next pose is a first one; the body stays known."""
+        self._solution = None
+        self._previous = None
+        self._sites = []
+        self._points = []
+        self._watchdog.reset()
+        self._begin_motion()
 
     def set_shape(self, shape: BodyShape) -> None:
         """Fix the body; it is no longer estimated."""
