@@ -39,7 +39,8 @@ def test_on_loopback_pages_of_other_sites_are_refused(origin):
 
 
 @pytest.mark.parametrize(
-    "host", ["evil.example:8765", "", "0.0.0.0", "127.0.0.1, evil", "10.0.0.1"]
+    "host",
+    ["evil.example:8765", "", "0.0.0.0", "127.0.0.1, evil", "10.0.0.1", "localhost:8765, evil"],
 )
 def test_a_name_that_another_site_gave_this_machine_is_refused(host):
     assert "another name" in Door(token="").refusal(token="", host=host, origin=None)

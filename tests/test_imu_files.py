@@ -92,6 +92,13 @@ def test_quaternions_are_normalised(tmp_path):
     assert np.allclose(np.linalg.norm(track.orientation_wxyz, axis=1), 1)
 
 
+def test_accelerations_beyond_every_scale_are_missing(tmp_path):
+    path = tmp_path / "imu.csv"
+    path.write_text("time_s,qw,qx,qy,qz,ax,ay,az\n0,1,0,0,0,1e39,0,0\n0.01,1,0,0,0,0,9.8,0\n")
+    accel = read_imu(path, format="csv").accel_m_s2
+    assert np.isnan(accel[0]).all() and np.allclose(accel[1], [0, 9.8, 0])
+
+
 def test_acceleration_may_be_left_out(tmp_path):
     path = tmp_path / "imu.csv"
     path.write_text("time_s,qw,qx,qy,qz\n0,1,0,0,0\n0.01,1,0,0,0\n")

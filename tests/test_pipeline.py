@@ -46,6 +46,13 @@ def test_people_are_sorted_by_a_sorter_of_ones_own(data, setup):
     assert step.updates == step.estimates == ()
 
 
+def test_whoever_is_to_be_found_anew_has_an_estimator_all_the_same(data, setup):
+    pipeline = Pipeline(setup)
+    pipeline.reinitialise()
+    name = setup.subjects[0].name
+    assert pipeline.estimator(name).model.name == name
+
+
 def test_a_setup_that_nothing_can_sort_is_refused(setup):
     with pytest.raises(SessionError, match="two cameras or more"):
         replace(setup, associate="paper", rig=setup.rig.subset(setup.rig.names[:1]))

@@ -156,6 +156,22 @@ def test_what_doctor_refuses_solve_refuses_and_the_other_way_round(case, sound, 
         assert where in said or name in said
 
 
+@pytest.mark.parametrize(("keypoints", "refused"), [(25, False), (17, True)])
+def test_keypoints_of_another_detector_are_refused_before_videos_are_looked_at(
+    keypoints, refused, sound, tmp_path
+):
+    session = shutil.copytree(sound, tmp_path / "session")
+    heatmaps = np.zeros((1, keypoints, 32, 24), np.float32)
+    constant_network(session / "pose.onnx", ("n", 3, 128, 96), {"maps": heatmaps})
+    by_doctor, told_by_doctor = verdict("doctor", session)
+    assert by_doctor is refused, told_by_doctor
+    if refused:
+        by_solve, told_by_solve = verdict("solve", session)
+        assert by_solve
+        for said in (told_by_doctor, told_by_solve):
+            assert "the detector finds coco17" in said and "'cam0' body25" in said
+
+
 @pytest.mark.parametrize("case", TIMES)
 def test_times_are_judged_alike(case, solvable, tmp_path):
     spoil, refused = TIMES[case]

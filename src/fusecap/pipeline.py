@@ -190,7 +190,7 @@ class Pipeline:
                 landmarks,
                 readings.get(update.name),
             )
-            work.append((self._estimator(update.name), update, observation))
+            work.append((self.estimator(update.name), update, observation))
         if self._pool is None or len(work) < 2:
             results = [_follow(*item) for item in work]
         else:
@@ -235,7 +235,9 @@ class Pipeline:
         return [estimate for estimate in found if estimate is not None]
 
     def estimator(self, name: str) -> Estimator:
-        """The estimator of a subject that has been followed."""
+        """A subject's; a new one for whoever is not followed, or found anew and not seen since."""
+        if name not in self._estimators:
+            self._estimators[name] = make_estimator(self._setup, self.model(name))
         return self._estimators[name]
 
     def model(self, name: str) -> SubjectModel:
@@ -342,11 +344,6 @@ class Pipeline:
             person=np.full(len(self._setup.rig), -1),
             landmarks_in_world_m=np.full((len(self._setup.landmarks.landmark_names), 3), np.nan),
         )
-
-    def _estimator(self, name: str) -> Estimator:
-        if name not in self._estimators:
-            self._estimators[name] = make_estimator(self._setup, self.model(name))
-        return self._estimators[name]
 
 
 def _projected(camera: Camera, points_m: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:

@@ -116,6 +116,7 @@ def detect_missing(session: Session, *, quiet: bool) -> Detected | None:
         video_setup,
     )
     from fusecap.detect.build import build_detector
+    from fusecap.sources.session_cameras import refuse_other_landmarks
 
     cameras = session_videos(session, undetected=True)
     if not cameras:
@@ -124,6 +125,7 @@ def detect_missing(session: Session, *, quiet: bool) -> Detected | None:
     ask_for_networks(options, quiet=quiet)
     with progress(quiet=quiet, rate=True) as show:
         detector = build_detector(options, show)
+        refuse_other_landmarks(session, detector.landmarks.name)
         setup = video_setup(session, cameras, detector.landmarks)
         found = detect_videos(cameras, detector, setup=setup, progress=show)
     _warn(found)

@@ -11,6 +11,7 @@ from fusecap.doctor.videos import check_videos
 from fusecap.errors import FusecapError
 from fusecap.findings import Findings
 from fusecap.sources.session import Session
+from fusecap.sources.session_cameras import refuse_other_landmarks
 
 
 def check_detection(session: Session, findings: Findings) -> None:
@@ -30,11 +31,11 @@ def check_detection(session: Session, findings: Findings) -> None:
             f"{', '.join(undetected)}",
             "fusecap detect finds them; fusecap solve does so too",
         )
-    _check_networks(detector_options(session), findings)
+    _check_networks(session, detector_options(session), findings)
 
 
-def _check_networks(options: DetectorOptions, findings: Findings) -> None:
-    """Whether they are there, and then whether they make a detector."""
+def _check_networks(session: Session, options: DetectorOptions, findings: Findings) -> None:
+    """Whether they are there, then whether they make a detector of the other cameras' keypoints."""
     there = True
     for model in dict.fromkeys((options.model, options.person_model)):
         try:
@@ -56,6 +57,7 @@ def _check_networks(options: DetectorOptions, findings: Findings) -> None:
             findings.add("error", "detector", str(error))
     if there:
         try:
-            build_detector(options, threads=1)
+            detector = build_detector(options, threads=1)
+            refuse_other_landmarks(session, detector.landmarks.name)
         except FusecapError as error:
-            findings.add("error", "detector", str(error))
+            findings.add("error", "detector", str(error).removeprefix(f"{session.path}: "))

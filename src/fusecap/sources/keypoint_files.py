@@ -90,12 +90,12 @@ def read_keypoints(
     looks = PeopleStore(APPEARANCE_SIZE, dtype=np.uint8)
     shown = False
     broken: list[str] = []
-    for done, (_, path) in enumerate(numbered, start=1):
+    for done, file in enumerate(numbered.values(), start=1):
         try:
-            found, appearance = _read_frame(path, landmarks)
+            found, appearance = _read_frame(os.path.join(folder, file), landmarks)
         except _BrokenFile:
             found, appearance = np.empty((0, len(landmarks.landmark_names), 3)), unknown(0)
-            broken.append(os.path.basename(path))
+            broken.append(file)
         people.append(found)
         looks.append(appearance)
         shown = shown or bool(appearance.any())
@@ -106,7 +106,7 @@ def read_keypoints(
             f"{folder}: none of the {len(numbered)} keypoint files can be read "
             f"(first: {broken[0]}); expected OpenPose JSON: run the detector again"
         )
-    frames = np.array([number for number, _ in numbered], dtype=np.int64)
+    frames = np.fromiter(numbered, dtype=np.int64)
     times_s = frames / rate_hz
     record = read_record(folder) if own_times else None
     if record is not None:
@@ -146,7 +146,8 @@ def frame_number(name: str) -> int | None:
     return int(match.group(1)) if match else None
 
 
-def _numbered_files(folder: Path) -> list[tuple[int, str]]:
+def _numbered_files(folder: Path) -> dict[int, str]:
+    """Names by frame number, which rises."""
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; expected one keypoint JSON per frame")
     by_frame: dict[int, str] = {}
@@ -161,18 +162,18 @@ def _numbered_files(folder: Path) -> list[tuple[int, str]]:
                     "the frame's number"
                 )
             if number in by_frame:
-                pair = sorted((os.path.basename(by_frame[number]), entry.name))
+                pair = sorted((by_frame[number], entry.name))
                 raise InputError(
                     f"{folder}: {pair[0]} and {pair[1]} are both frame {number}; "
                     "expected one folder per camera"
                 )
-            by_frame[number] = entry.path
+            by_frame[number] = entry.name
     if not by_frame:
         raise InputError(
             f"{folder}: no keypoint files; expected one .json per frame whose name ends in the "
             "frame's number"
         )
-    return sorted(by_frame.items())
+    return dict(sorted(by_frame.items()))
 
 
 def read_people(path: Path, landmarks: LandmarkSet) -> np.ndarray | None:
@@ -227,9 +228,10 @@ def _bytes(looks: Any) -> list[int]:
 
 def sets_in(folder: Path) -> list[LandmarkSet]:
     """Those with as many keypoints as the first person in a folder; raises `InputError`."""
-    for _, path in _numbered_files(folder):
+    for file in _numbered_files(folder).values():
         try:
-            counts = {len(values) / 3 for values, _ in _persons(path) if values}
+            persons = _persons(os.path.join(folder, file))
+            counts = {len(values) / 3 for values, _ in persons if values}
         except _BrokenFile:
             continue
         if counts:

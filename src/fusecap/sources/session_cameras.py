@@ -93,9 +93,11 @@ def open_rig(session: Session) -> tuple[Rig, list[Finding]]:
 def common_landmarks(session: Session) -> LandmarkSet | None:
     """The one landmark set of all cameras, with the session's offsets; None without cameras.
 
-    Raises `SessionError` when cameras differ, `InputError` for offsets that cannot be used.
+    Of a video that was not looked at yet it is the others'. Raises `SessionError` when cameras
+    differ, `InputError` for offsets that cannot be used.
     """
-    names = {camera.name: _landmark_set_name(session, camera) for camera in session.cameras}
+    seen = [camera for camera in session.cameras if not _is_undetected(camera)]
+    names = {c.name: _landmark_set_name(session, c) for c in seen or session.cameras}
     if len(set(names.values())) > 1:
         listed = ", ".join(f"'{camera}' openpose-{name}" for camera, name in names.items())
         raise SessionError(
@@ -108,6 +110,31 @@ def common_landmarks(session: Session) -> LandmarkSet | None:
     if session.settings.landmark_offsets is None:
         return landmarks
     return landmarks.calibrated(read_offsets(session.settings.landmark_offsets, landmarks.name))
+
+
+def refuse_other_landmarks(session: Session, found: str) -> None:
+    """Where a detector finds the set `found` in videos, and other cameras have others' keypoints.
+
+    What was detected in a video is no matter: it is detected again. Raises `SessionError`.
+    """
+    session = with_detections(session)
+    others = {
+        camera.name: _landmark_set_name(session, camera)
+        for camera in session.cameras
+        if camera.keypoints is not None
+        and (camera.video is None or camera.keypoints != session.detection_folder(camera))
+    }
+    listed = ", ".join(f"'{camera}' {name}" for camera, name in others.items() if name != found)
+    if listed:
+        raise SessionError(
+            f"{session.path}: the detector finds {found}, but cameras have other keypoints "
+            f"({listed}); set model under [detector] to a network of theirs, or leave their "
+            "keypoints out and name their videos"
+        )
+
+
+def _is_undetected(camera: CameraSettings) -> bool:
+    return camera.keypoints is None and camera.video is not None
 
 
 def _landmark_set_name(session: Session, camera: CameraSettings) -> str:

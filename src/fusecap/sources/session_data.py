@@ -8,6 +8,7 @@ session's rate are not interpolated at all.
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -349,23 +350,26 @@ def content_hash(session: Session) -> str:
     for path in inputs:
         if path is not None and path.is_dir():
             for file in sorted(path.iterdir()):
-                _add_file(digest, file, with_content=True)
+                _add_file(digest, file)
         elif path is not None:
-            _add_file(digest, path, with_content=True)
+            _add_file(digest, path)
     for camera in session.cameras:
         if camera.keypoints is not None and camera.keypoints.is_dir():
-            for file in sorted(camera.keypoints.glob("*.json")):
-                _add_file(digest, file, with_content=False)
+            with os.scandir(camera.keypoints) as entries:
+                frames = [e for e in entries if e.name.endswith(".json") and e.is_file()]
+                sizes = sorted((e.name, e.stat().st_size) for e in frames)
+            for name, size in sizes:
+                digest.update(f"{name}\0{size}\0".encode())
             record = read_record(camera.keypoints)
             if record is not None:
                 digest.update(f"{record.video.sha256}\0{record.detector}\0".encode())
     return digest.hexdigest()
 
 
-def _add_file(digest: hashlib._Hash, path: Path, *, with_content: bool) -> None:
+def _add_file(digest: hashlib._Hash, path: Path) -> None:
     if not path.is_file():
         return
     size = path.stat().st_size
     digest.update(f"{path.name}\0{size}\0".encode())
-    if with_content and size <= HASHED_BYTES:
+    if size <= HASHED_BYTES:
         digest.update(read_bytes(path, SENSORS))

@@ -41,7 +41,7 @@ class Door:
         if self.token:
             known = secrets.compare_digest(token.encode(), self.token.encode())
             return "" if known else "the address lacks its token"
-        if not is_loopback(_hostname(f"//{host}")):
+        if "," in host or not is_loopback(_hostname(f"//{host}")):
             return "asked for by another name than this machine's own"
         if origin is not None and not is_loopback(_hostname(origin)):
             return "opened by another site"

@@ -104,11 +104,13 @@ def tidy(
     fresh = np.concatenate([[True], np.diff(times_s) > 0])
     _note(said, ~fresh, "{} duplicate timestamps dropped")
     times_s, quaternion, accel = times_s[fresh], quaternion[fresh], accel[fresh]
+    with np.errstate(over="ignore"):  # of numbers beyond every scale, which become infinite
+        accel = accel.astype(np.float32)
     measured = np.all(np.isfinite(accel), axis=1, keepdims=True)
     return ImuTrack(
         times_s=times_s,
         orientation_wxyz=quaternion.astype(np.float32),
-        accel_m_s2=np.where(measured, accel, np.nan).astype(np.float32),
+        accel_m_s2=np.where(measured, accel, np.float32(np.nan)),
         notes=tuple(said),
         clock=clock,
         heading_known=heading_known,
@@ -130,7 +132,8 @@ def specific_force(
     if usable.any():
         imu_world_from_imu = from_wxyz(orientation_wxyz[usable])
         with_gravity = free_accel_in_imu_world_m_s2[usable] + [0.0, 0.0, GRAVITY_M_S2]
-        result[usable] = imu_world_from_imu.inv().apply(with_gravity)
+        with np.errstate(invalid="ignore", over="ignore"):  # of what `tidy` then drops
+            result[usable] = imu_world_from_imu.inv().apply(with_gravity)
     return result
 
 
