@@ -75,7 +75,8 @@ class SubjectImus:
         self._imus = imus
         self._times_s = times_s
         self._block = -1
-        self._rotations, self._accelerations = resample_imus(imus, times_s[:0])
+        self._rotations = np.empty((0, len(imus), 3, 3))
+        self._accelerations = np.empty((0, len(imus), 3))
 
     def reading(self, instant: int) -> ImuReading:
         """What the sensors say at one of the solve's instants."""
