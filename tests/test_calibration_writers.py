@@ -1,5 +1,6 @@
 import json
 import tomllib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -175,3 +176,71 @@ def test_easymocap_as_its_own_scripts_write_it(tmp_path):
     assert camera.distortion[:2].tolist() == [0.1, 0.02]
     assert camera.translation.tolist() == [0.1, 0.2, 3.0]
     assert np.allclose(Rotation.from_matrix(camera.rotation).as_rotvec(), [0, 0.5, 0])
+
+
+def calibio(rig: Rig, **parameters: float) -> dict:
+    """As calib.io's Camera Calibrator writes them, in millimetres."""
+    cameras = []
+    for camera in rig.cameras:
+        k1, k2, p1, p2, k3 = camera.distortion
+        values = {
+            "f": camera.matrix[0, 0],
+            "ar": camera.matrix[1, 1] / camera.matrix[0, 0],
+            "cx": camera.matrix[0, 2],
+            "cy": camera.matrix[1, 2],
+            **{"k1": k1, "k2": k2, "k3": k3, "p1": p1, "p2": p2, "k4": 0.0, "tauX": 0.0},
+            **parameters,
+        }
+        size = dict(zip(("width", "height"), camera.size_px, strict=True))
+        data = {
+            "CameraModelCRT": {"CameraModelBase": {"imageSize": size}},
+            "parameters": {key: {"state": 0, "val": value} for key, value in values.items()},
+        }
+        model = {
+            "polymorphic_name": "libCalib::CameraModelOpenCV",
+            "ptr_wrapper": {"valid": 1, "data": data},
+        }
+        turn = Rotation.from_matrix(camera.rotation).as_rotvec()
+        transform = {
+            "rotation": dict(zip(("rx", "ry", "rz"), turn, strict=True)),
+            "translation": dict(zip("xyz", 1000 * camera.translation, strict=True)),
+        }
+        cameras.append({"model": model, "transform": transform})
+    return {"Calibration": {"cameras": cameras, "poses": []}}
+
+
+def test_calibio_is_read_by_number_and_in_its_unit(tmp_path):
+    path, rig = tmp_path / "calibration.json", ring()
+    path.write_text(json.dumps(calibio(rig)))
+    numbered = Rig(
+        cameras=tuple(replace(camera, name=str(i)) for i, camera in enumerate(rig.cameras))
+    )
+    assert_same(load_rig(path, unit="mm"), numbered)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "told"),
+    [
+        (
+            lambda c: c["model"].update(polymorphic_name="libCalib::CameraModelFisheye"),
+            "lens model",
+        ),
+        (lambda c: c.pop("transform"), "no transform.rotation"),
+        (lambda c: c["transform"].update(rotation=[1, 2, 3]), "no transform.rotation"),
+        (lambda c: c["model"]["ptr_wrapper"]["data"]["parameters"].pop("f"), "f: holds"),
+        (lambda c: c["model"]["ptr_wrapper"]["data"]["parameters"].update(k4=3), "k4: holds"),
+    ],
+)
+def test_calibio_that_is_not_whole_is_refused(tmp_path, spoil, told):
+    path, document = tmp_path / "calibration.json", calibio(ring())
+    spoil(document["Calibration"]["cameras"][0])
+    path.write_text(json.dumps(document))
+    with pytest.raises(CalibrationError, match=told):
+        load_rig(path, unit="mm")
+
+
+def test_lenses_of_more_terms_than_five_are_refused_in_calibio(tmp_path):
+    path = tmp_path / "calibration.json"
+    path.write_text(json.dumps(calibio(ring(), k4=0.1)))
+    with pytest.raises(CalibrationError, match="rational"):
+        load_rig(path, unit="mm")

@@ -323,3 +323,15 @@ def test_half_lost_dot_recording_says_so(data_dir):
         data_dir / "opensense_xsens_mtw/dot_csv/LFemur_20210820_202113_831.csv", format="xsens-dot"
     )
     assert track.gaps.sum() > 10
+
+
+def test_moments_by_iso_8601_are_times(tmp_path):
+    path = tmp_path / "thigh.csv"
+    path.write_text(
+        "time_iso,qw,qx,qy,qz,ax,ay,az\n"
+        "2026-11-28T23:59:59.990Z,1,0,0,0,0,0,9.81\n"
+        "2026-11-29 01:00:00.000+01:00,1,0,0,0,0,0,9.81\n"
+        "2026-11-29T00:00:00.010,1,0,0,0,0,0,9.81\n"
+    )
+    track = read_imu(path, format="csv")
+    assert np.allclose(track.times_s, [0.0, 0.01, 0.02], atol=1e-6)

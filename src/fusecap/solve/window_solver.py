@@ -163,8 +163,8 @@ class WindowSolver:
         measured.contact[row] = 0.0
         self.count += 1
 
-    def refine(self, max_iterations: int, tolerance: float | None = None) -> None:
-        """Levenberg-Marquardt from where the poses are; never makes their cost worse.
+    def refine(self, max_iterations: int, tolerance: float | None = None) -> float:
+        """Levenberg-Marquardt from where the poses are to the cost given back, never a worse one.
 
         Ends before a step that promises to lower the cost by less than the share `tolerance`;
         without one, after the first that does nearly what the quadratic model promises: then the
@@ -199,6 +199,7 @@ class WindowSolver:
             cost, damping = trial_cost, max(damping / 10.0, _LEAST_DAMPING)
             if tolerance is None and abs(decrease - promised) < _KEPT_PROMISE * promised:
                 break
+        return cost
 
     def ahead(
         self, coming: Sequence[tuple[Observation, Float[np.ndarray, " p"]]], max_iterations: int
@@ -207,18 +208,20 @@ class WindowSolver:
 
         They go on from the window, which stays as it is, and are as many as there is room for.
         Nobody is said to stand in them: only pictures, or more time, could tell. Poses that have
-        gone astray would keep each other there: where that costs less they begin at the newest.
+        gone astray would keep each other there: where no sensor tells of them, or staying at the
+        newest costs less than what they come to, they begin there.
         """
         kept, theta = self.count, self._theta[: self.count].copy()
         try:
             for observation, start in coming:
                 self._append(observation, start)
-            reached = self._theta[: self.count]
-            held = reached.copy()
+            held = self._theta[: self.count].copy()
             held[kept:] = theta[-1]
-            if self._evaluate(held) < self._evaluate(reached):
-                reached[:] = held
-            self.refine(max_iterations)
+            held_cost = self._evaluate(held)
+            told = bool(self._measured.present[kept : self.count].any())
+            if not (told and self.refine(max_iterations) <= held_cost):
+                self._theta[: self.count] = held
+                self.refine(max_iterations)
             return Ahead(self._theta[kept : self.count].copy(), *self.newest_spread())
         finally:
             self.count, self._theta[:kept] = kept, theta

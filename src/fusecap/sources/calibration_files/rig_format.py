@@ -12,6 +12,10 @@ StatedCamera = tuple[str, Callable[[], Camera]]
 """A name in a file, and what reads that camera or raises `CalibrationError`."""
 
 
+RigTexts = Callable[[Path, Rig, Sequence[str]], dict[Path, str]]
+"""What writes cameras: files by path."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RigFormat:
     """How it is told from others, read and written."""
@@ -25,8 +29,9 @@ class RigFormat:
     read: Callable[[Path], list[StatedCamera] | None]
     """The cameras, none judged before it is asked for; None where the file or folder is not in this
     format."""
-    texts: Callable[[Path, Rig, Sequence[str]], dict[Path, str]]
-    """The files, for cameras in metres and notes of which a format without comments has none."""
+    texts: RigTexts | None
+    """The files, for cameras in metres and notes of which a format without comments has none; None:
+    it is read only."""
 
     def has_name(self, path: Path) -> bool:
         """Whether it would be written to this path."""

@@ -9,7 +9,7 @@ from fusecap.errors import CalibrationError
 from fusecap.files import check_writable, write_whole
 from fusecap.geometry.camera import Rig
 from fusecap.sources.calibration_files.formats import rig_formats
-from fusecap.sources.calibration_files.rig_format import RigFormat
+from fusecap.sources.calibration_files.rig_format import RigFormat, RigTexts
 
 
 def write_rig(path: Path | str, rig: Rig, *, notes: Sequence[str] = ()) -> list[Path]:
@@ -25,7 +25,8 @@ def write_rig(path: Path | str, rig: Rig, *, notes: Sequence[str] = ()) -> list[
     if not len(rig):
         raise CalibrationError(f"{path}: a calibration without cameras is not written")
     check_rig_path(path)
-    texts = _format_of(path).texts(path, rig, notes)
+    _, texts_of = _format_of(path)
+    texts = texts_of(path, rig, notes)
     for file, text in texts.items():
         write_whole(file, text)
     return list(texts)
@@ -33,13 +34,15 @@ def write_rig(path: Path | str, rig: Rig, *, notes: Sequence[str] = ()) -> list[
 
 def check_rig_path(path: Path) -> None:
     """Before the work that finds the cameras: raises where `write_rig` could not write them."""
-    check_writable(path if _format_of(path).suffixes else path / "camera.json")
+    format, _ = _format_of(path)
+    check_writable(path if format.suffixes else path / "camera.json")
 
 
-def _format_of(path: Path) -> RigFormat:
+def _format_of(path: Path) -> tuple[RigFormat, RigTexts]:
     """By the name of what is to be written."""
-    for format in rig_formats():
+    written = [(format, format.texts) for format in rig_formats() if format.texts is not None]
+    for format, texts in written:
         if format.has_name(path):
-            return format
-    known = " or ".join(format.what for format in rig_formats())
+            return format, texts
+    known = " or ".join(format.what for format, _ in written)
     raise CalibrationError(f"{path}: no calibration format has this name; expected {known}")

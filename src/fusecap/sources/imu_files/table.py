@@ -8,6 +8,7 @@ import itertools
 from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -110,11 +111,19 @@ def read_table(path: Path, *first_columns: str) -> ImuTable:
 
 
 def number(cell: str) -> float:
-    """The cell's value, also with a decimal comma; NaN where it is none."""
+    """The cell's value, also with a decimal comma; NaN where it is none.
+
+    A moment by ISO 8601 is its seconds since 1970, in UTC where it names no zone.
+    """
     try:
         return float(cell.replace(",", ".", 1))
     except ValueError:
+        pass
+    try:
+        moment = datetime.fromisoformat(cell.strip())
+    except ValueError:
         return float("nan")
+    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
 
 
 def chosen(path: Path, wanted: str | None, present: Sequence[str]) -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from fusecap.sources.calibration_files.rig_format import RigFormat
 
-NAMES = ("aniposelib", "qualisys", "panoptic", "easymocap", "shelf")
+NAMES = ("aniposelib", "qualisys", "panoptic", "calibio", "easymocap", "shelf")
 """Of their modules, in the order in which they look at a file."""
 
 

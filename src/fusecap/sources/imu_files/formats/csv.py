@@ -2,7 +2,8 @@
 
 The quaternion is imu_world_from_imu; acceleration is specific force in the imu frame [m/s²], and
 may be left out or NaN. Without quaternions: `Gyr_X..Z` [rad/s], `Acc_X..Z` and perhaps `Mag_X..Z`
-of the raw sensor. Times may also be `time_ms`, `time_us` or `time_ns`, and count from 1970.
+of the raw sensor. Times may also be `time_ms`, `time_us` or `time_ns`, and count from 1970, or
+`time_iso`: moments by ISO 8601.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from fusecap.sources.imu_files.raw import Orientation, orientation_from_raw
 from fusecap.sources.imu_files.table import read_table
 from fusecap.sources.imu_files.track import ImuTrack, since_first, tidy
 
-_SECONDS = {"time_s": 1.0, "time_ms": 1e-3, "time_us": 1e-6, "time_ns": 1e-9}
+_SECONDS = {"time_s": 1.0, "time_ms": 1e-3, "time_us": 1e-6, "time_ns": 1e-9, "time_iso": 1.0}
 
 
 def read(path: Path, _sensor: str | None, _rate_hz: float | None) -> ImuTrack:
