@@ -3,7 +3,8 @@
     uv run --frozen python benchmarks/exports.py --minutes 30 [--formats glb,csv]
 
 The motion is made up (simulated), every joint moves. Prints seconds, those of them that processors
-worked (Blender's too), megabytes and the peak memory of each format, each in a process of its own.
+worked (Blender's too), megabytes and the peak memory of each format, each in a process of its own
+that reads the take from its file; then of one person's motion onto a character.
 """
 
 from __future__ import annotations
@@ -14,16 +15,19 @@ import resource
 import sys
 import tempfile
 import time
+from pathlib import Path
 
 import numpy as np
 
 from fusecap.body.shape import BodyShape
 from fusecap.body.skeleton import PAPER21
 from fusecap.evaluate.demo_scene import demo_scene
+from fusecap.exports.characters.retarget import retarget
 from fusecap.exports.formats import FORMATS
 from fusecap.exports.take_files import export_take
 from fusecap.exports.take_format import ExportOptions
-from fusecap.take import Take, take_from_theta
+from fusecap.stored_take import load_take
+from fusecap.take import Take, save_take, take_from_theta
 
 
 def long_take(minutes: float, rate_hz: float = 60.0) -> Take:
@@ -47,14 +51,22 @@ def long_take(minutes: float, rate_hz: float = 60.0) -> Take:
     )
 
 
-def measure(name: str, minutes: float) -> None:
-    take = long_take(minutes)
+def write(name: str, stored: Path, folder: str) -> list[Path]:
+    """What is written in a format, or for "onto.glb" and "onto.fbx" of one person's motion."""
+    take = load_take(stored)
+    if name.startswith("onto."):
+        (avatar,) = export_take(take.of_frames(0, 1), folder, format="glb", stem="c", rig="mixamo")
+        return [retarget(take, avatar, Path(folder) / name, subject="anna").path]
     options = ExportOptions()
     if name == "openpose":
         options = ExportOptions(cameras=demo_scene(0, seconds=0.1).rig)
+    return export_take(take, folder, format=name, stem="t", options=options)
+
+
+def measure(name: str, stored: Path) -> None:
     with tempfile.TemporaryDirectory() as folder:
         began, worked_before_s = time.perf_counter(), _worked_s()
-        paths = export_take(take, folder, format=name, stem="t", options=options)
+        paths = write(name, stored, folder)
         took_s = time.perf_counter() - began
         worked_s = _worked_s() - worked_before_s
         files = [f for path in paths for f in (path.rglob("*") if path.is_dir() else [path])]
@@ -75,16 +87,19 @@ def _worked_s() -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--minutes", type=float, default=30.0)
-    parser.add_argument("--formats", default=",".join(FORMATS))
+    parser.add_argument("--formats", default=",".join([*FORMATS, "onto.glb", "onto.fbx"]))
     told = parser.parse_args()
-    for name in told.formats.split(","):
-        child = multiprocessing.get_context("spawn").Process(
-            target=measure, args=(name, told.minutes)
-        )
-        child.start()
-        child.join()
-        if child.exitcode:
-            print(f"{name:9} failed", file=sys.stderr)
+    with tempfile.TemporaryDirectory() as folder:
+        stored = Path(folder) / "t.npz"
+        save_take(long_take(told.minutes), stored)
+        for name in told.formats.split(","):
+            child = multiprocessing.get_context("spawn").Process(
+                target=measure, args=(name, stored)
+            )
+            child.start()
+            child.join()
+            if child.exitcode:
+                print(f"{name:9} failed", file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -586,6 +586,20 @@ def test_a_library_that_is_missing_is_named_with_its_extra(tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize(
+    ("program", "told"),
+    [
+        ("/nowhere/blender", "names /nowhere/blender, which is no program"),
+        ("false", "is it Blender"),
+    ],
+)
+def test_a_blender_that_is_none_is_named(tmp_path, monkeypatch, program, told):
+    monkeypatch.setenv("FUSECAP_BLENDER", program)
+    with pytest.raises(InputError, match=told):
+        export_take(two_walkers(2), tmp_path, format="fbx", stem="t")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
     ("format", "module", "told"),
     [("c3d", "ezc3d", "extra 'c3d'"), ("usd", "pxr", "extra 'usd'"), ("fbx", "bpy", "Blender")],
 )

@@ -281,6 +281,8 @@ def test_broken_characters_are_one_line(tmp_path):
         fusecap.retarget(take, avatar, avatar)
     with pytest.raises(InputError, match=r"written as \.glb, \.vrm or \.fbx"):
         fusecap.retarget(take, avatar, tmp_path / "x.obj")
+    with pytest.raises(TakeError, match="nobody is tracked in any frame"):
+        fusecap.retarget(with_gap(take, slice(None)), avatar, out)
     with pytest.raises(InputError, match="anna, ben: say whose motion it is"):
         fusecap.retarget(two_walkers(3), avatar, out)
     with pytest.raises(TakeError, match="no subject 'bob'"):
@@ -301,6 +303,9 @@ def test_the_command_shows_the_bones_it_matched(tmp_path):
     assert result.exit_code == 0, result.output
     told = json.loads(result.output)
     assert told["bones"]["left_shank"] == "mixamorig:LeftLeg"
+    assert told["notes"] == [
+        "'anna' is not tracked in 1 frames (0.03-0.03 s): .glb hold the last pose there"
+    ]
     assert [Path(file).name for file in told["files"]] == ["t_anna_avatar.glb"]
     assert "mixamorig:LeftLeg" in CliRunner().invoke(app, command).output
 

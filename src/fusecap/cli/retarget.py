@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from fusecap.cli.common import Json, named_once, print_json
-from fusecap.cli.terminal import console, table_of, wrote
+from fusecap.cli.terminal import console, note, table_of, wrote
 from fusecap.files import safe_name
 
 EXAMPLE = "Example: fusecap retarget duo/duo.npz avatar.vrm --subject anna --out anna.glb"
@@ -41,24 +41,30 @@ def retarget(
     from fusecap.batch.replay import open_take
     from fusecap.exports.characters.retarget import retarget as onto
     from fusecap.exports.made_files import list_made, made_stem
+    from fusecap.exports.take_files import held_pose
 
     whose = "" if subject is None else f"_{safe_name(subject)}"
     stem = f"{made_stem(take)}{whose}_{safe_name(character.stem)}"
     ending = ".fbx" if character.suffix.lower() == ".fbx" else ".glb"
+    opened = open_take(take)
     done = onto(
-        open_take(take),
+        opened,
         character,
         out or take.with_name(stem + ending),
         subject=subject,
         bones=named_once("--map", map, "BONE=NAME"),
     )
     list_made(take, [done.path])
+    notes = held_pose(opened, done.subject, [done.path.suffix])
     if as_json:
-        print_json({"files": [str(done.path)], "bones": done.bones, "scale": done.scale})
+        told = {"files": [str(done.path)], "bones": done.bones, "scale": done.scale}
+        print_json({**told, "notes": notes})
         return
     table = table_of("ours", "the character's")
     for bone, name in done.bones.items():
         table.add_row(bone, name)
     console.print(table)
     console.print(f"  ways through the room are scaled by {done.scale:.3f}, as legs are")
+    for text in notes:
+        note(text)
     wrote(done.path)

@@ -44,7 +44,10 @@ def run_in_blender(script: str, told: Mapping[str, Any], makes: Path) -> None:
         raise InputError(f"cannot run {command[0]}: {error.strerror or error}") from error
     if not makes.exists():
         last = (run.stderr.strip() or run.stdout.strip() or "no word").splitlines()[-1]
-        raise InputError(f"{command[0]} wrote no {makes.suffix.upper()[1:]}: {last}")
+        raise InputError(
+            f"{command[0]} wrote no {makes.suffix.upper()[1:]}, is it Blender 4.2 or newer, or a "
+            f"Python that has bpy? It said: {last}"
+        )
 
 
 def fbx_from_glb(glb: Path, fbx: Path, *, rate_hz: float, frames: int, step: int = 1) -> None:
@@ -55,7 +58,10 @@ def fbx_from_glb(glb: Path, fbx: Path, *, rate_hz: float, frames: int, step: int
 
 def blender_command() -> list[str]:
     """What runs a script that follows as the last argument."""
-    named = os.environ.get(VARIABLE) or shutil.which("blender")
+    told = os.environ.get(VARIABLE)
+    if told and shutil.which(told) is None:
+        raise InputError(f"{VARIABLE} names {told}, which is no program that can be run")
+    named = told or shutil.which("blender")
     if not named and find_spec("bpy") is not None:
         named = sys.executable
     if not named:

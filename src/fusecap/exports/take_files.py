@@ -153,21 +153,26 @@ def held_poses(take: Take, files: Sequence[TakeFile]) -> list[str]:
     told = []
     for row, name in enumerate(take.subject_names):
         endings = {f.path.suffix: None for f in files if f.format.holds and row in f.rows}
-        tracked = take.tracked[row]
-        if not endings or tracked.all() or not tracked.any():
-            continue
-        edges = np.flatnonzero(np.diff(np.concatenate([[True], tracked, [True]])))
-        spans = [(int(first), int(end)) for first, end in edges.reshape(-1, 2)]
-        times = [
-            f"{take.time_s[first]:.2f}-{take.time_s[end - 1]:.2f}"
-            for first, end in spans[:_SPANS_TOLD]
-        ]
-        more = f" and {len(spans) - len(times)} more" if len(spans) > len(times) else ""
-        told.append(
-            f"'{name}' is not tracked in {int((~tracked).sum())} frames ({', '.join(times)} s"
-            f"{more}): {', '.join(endings)} hold the last pose there"
-        )
+        if endings:
+            told += held_pose(take, name, endings)
     return told
+
+
+def held_pose(take: Take, subject: str, endings: Iterable[str]) -> list[str]:
+    """When files of these endings show the last pose of somebody who is not tracked throughout."""
+    tracked = take.tracked[take.subject(subject)]
+    if tracked.all() or not tracked.any():
+        return []
+    edges = np.flatnonzero(np.diff(np.concatenate([[True], tracked, [True]])))
+    spans = [(int(first), int(end)) for first, end in edges.reshape(-1, 2)]
+    times = [
+        f"{take.time_s[first]:.2f}-{take.time_s[end - 1]:.2f}" for first, end in spans[:_SPANS_TOLD]
+    ]
+    more = f" and {len(spans) - len(times)} more" if len(spans) > len(times) else ""
+    return [
+        f"'{subject}' is not tracked in {int((~tracked).sum())} frames ({', '.join(times)} s"
+        f"{more}): {', '.join(endings)} hold the last pose there"
+    ]
 
 
 def _known_format(name: str) -> TakeFormat:

@@ -21,7 +21,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from fusecap.body.rigs import PRESETS
-from fusecap.errors import InputError
+from fusecap.errors import InputError, TakeError
 from fusecap.exports.blender import run_in_blender
 from fusecap.exports.characters.bone_names import BoneMap, bone_map
 from fusecap.exports.characters.bone_words import spine_shares
@@ -55,6 +55,7 @@ class Retargeted:
     """What was written, and how bones were matched."""
 
     path: Path
+    subject: str
     bones: dict[str, str]
     """The character's names by ours."""
     scale: float
@@ -101,6 +102,7 @@ def retarget(
             _write(read, placed, motion, out)
     return Retargeted(
         path=out,
+        subject=take.subject_names[row],
         bones={bone: read.names[node] for bone, node in mapped.bones.items()}
         | {f"spine {n + 1}": read.names[node] for n, node in enumerate(mapped.spine)},
         scale=placed.scale,
@@ -111,8 +113,10 @@ def _row(take: Take, subject: str | None) -> int:
     if subject is not None:
         return take.subject(subject)
     people = [row for row in range(len(take.subject_names)) if take.tracked[row].any()]
-    if len(people) != 1:
-        names = ", ".join(take.subject_names[row] for row in people) or "nobody"
+    if not people:
+        raise TakeError("nobody is tracked in any frame of the take: there is no motion to take")
+    if len(people) > 1:
+        names = ", ".join(take.subject_names[row] for row in people)
         raise InputError(f"the take has {names}: say whose motion it is, --subject NAME")
     return people[0]
 
