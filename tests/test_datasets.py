@@ -366,7 +366,29 @@ def test_array_cannot_ask_for_more_memory_than_the_file_has(tmp_path):
     assert load_pickle(path).size == 0
 
 
-@pytest.mark.parametrize("content", [b"", b"not a pickle", pickle.dumps(np.zeros(100))[:60]])
+SHORT_DTYPE = (
+    b"\x80\x02cnumpy\ndtype\nX\x02\x00\x00\x00f8\x89\x88\x87R(K\x03X\x01\x00\x00\x00N"
+    b"NJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00tb."
+)
+"""A dtype's state with too few entries, over which NumPy ends the process."""
+FAR_MEMO = b"\x80\x02}r\x10\x10\x28\x4b."
+"""Remembers a value as the 1,260,916,752nd, for which the unpickler in C allots 20 GB."""
+
+
+def test_a_memory_of_billions_of_values_costs_nothing(tmp_path):
+    path = tmp_path / "data.pkl"
+    path.write_bytes(FAR_MEMO)
+    assert load_pickle(path) == {}
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        *(b"", b"not a pickle", pickle.dumps(np.zeros(100))[:60], SHORT_DTYPE),
+        pickle.dumps(np.zeros(4), 2).replace(b"K\x04\x85", b"K\x05\x85"),
+        pickle.dumps(np.zeros(4, [("a", "f8")])),
+    ],
+)
 def test_garbled_pickle_is_no_crash(tmp_path, content):
     path = tmp_path / "data.pkl"
     path.write_bytes(content)

@@ -6,6 +6,11 @@ few names that an array needs, with functions of its own, and refuses every othe
 rebuilt empty and filled from the bytes in the file, so a file cannot ask for more memory than it
 has bytes.
 
+What is left is C that believes the file: NumPy ends the process over a dtype's state with too few
+entries, and the unpickler in C allots room for as many remembered values as the highest number
+among them says. So dtypes and the states of arrays are checked here before NumPy sees them, and
+the unpickler is the one in Python.
+
     allowed     None, bool, int, float, str, bytes, list, tuple, dict, set, numpy arrays and scalars
     refused     everything else, by name, before anything is called
 """
@@ -13,10 +18,11 @@ has bytes.
 from __future__ import annotations
 
 import io
+import math
 import pickle
+import re
 import zipfile
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +65,9 @@ def load_npz_object(path: Path | str, name: str) -> Any:
     return value.reshape(-1)[0] if isinstance(value, np.ndarray) else value
 
 
+_PLAIN = re.compile(r"[<>|=]?([biufcSU][0-9]{1,6}|O8?|[?bBhHiIlLqQefdgSU])")
+
+
 class _Refused(Exception):
     pass
 
@@ -77,17 +86,54 @@ def _load(file: io.BufferedIOBase, where: str) -> Any:
         ) from None
 
 
+class _Dtype:
+    """One of plain numbers, text or objects, as a pickle makes it: a name, then its byte order."""
+
+    def __init__(self, name: str, align: object = False, copy: object = False) -> None:
+        if not _PLAIN.fullmatch(name):
+            raise ValueError(f"an array of {name[:40]!r}")
+        self.value = np.dtype(name)
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        _version, order, subarray, names, fields, *_ = state
+        if order not in ("<", ">", "|", "=") or (subarray, names, fields) != (None, None, None):
+            raise ValueError("an array of records")
+        self.value = self.value.newbyteorder(order)
+
+
+class _Array(np.ndarray):
+    """Empty, until its state has been read."""
+
+    def __setstate__(self, state: tuple[Any, ...], /) -> None:
+        version, shape, dtype, is_fortran, data = state
+        if any(type(length) is not int or length < 0 for length in shape):
+            raise ValueError(f"an array of shape {shape!r}")
+        if dtype.value.hasobject:
+            count, there = math.prod(shape), len(list(data))
+        else:
+            data = _bytes(data)
+            count, there = math.prod(shape) * dtype.value.itemsize, len(data)
+        if count != there:
+            raise ValueError(f"an array of shape {shape!r} and {there} bytes")
+        checked: Any = (version, tuple(shape), dtype.value, bool(is_fortran), data)
+        super().__setstate__(checked)
+
+
+def _bytes(data: bytes | str) -> bytes:
+    return data.encode("latin1") if isinstance(data, str) else bytes(data)
+
+
 def _empty_array(subtype: Any, shape: Any, typecode: Any) -> np.ndarray:
-    return np.ndarray.__new__(np.ndarray, (0,), dtype="b")
+    return _Array((0,), dtype="b")
 
 
-def _array_of_buffer(buffer: Any, dtype: Any, shape: Any, order: str) -> np.ndarray:
-    return np.frombuffer(buffer, dtype=dtype).reshape(shape, order="F" if order == "F" else "C")
+def _array_of_buffer(buffer: Any, dtype: _Dtype, shape: Any, order: str) -> np.ndarray:
+    values = np.frombuffer(buffer, dtype=dtype.value)
+    return values.reshape(shape, order="F" if order == "F" else "C")
 
 
-def _scalar(dtype: Any, data: bytes | str = b"") -> Any:
-    raw = data.encode("latin1") if isinstance(data, str) else data
-    return np.frombuffer(raw, dtype=dtype, count=1)[0]
+def _scalar(dtype: _Dtype, data: bytes | str = b"") -> Any:
+    return np.frombuffer(_bytes(data), dtype=dtype.value, count=1)[0]
 
 
 def _latin1(text: str, encoding: str = "latin1") -> bytes:
@@ -95,8 +141,8 @@ def _latin1(text: str, encoding: str = "latin1") -> bytes:
 
 
 _ADMITTED: dict[tuple[str, str], Any] = {
-    ("numpy", "ndarray"): np.ndarray,
-    ("numpy", "dtype"): np.dtype,
+    ("numpy", "ndarray"): "an array",
+    ("numpy", "dtype"): _Dtype,
     ("_codecs", "encode"): _latin1,
 }
 for _core in ("numpy.core", "numpy._core"):
@@ -105,12 +151,12 @@ for _core in ("numpy.core", "numpy._core"):
     _ADMITTED[(f"{_core}.numeric", "_frombuffer")] = _array_of_buffer
 
 
-class _ArraysOnly(pickle.Unpickler):
-    def find_class(self, module_name: str, global_name: str, /) -> Callable[..., Any]:
+class _ArraysOnly(pickle._Unpickler):
+    def find_class(self, module: str, name: str) -> Any:
         try:
-            return _ADMITTED[(module_name, global_name)]
+            return _ADMITTED[(module, name)]
         except KeyError:
-            raise _Refused(f"{module_name}.{global_name}") from None
+            raise _Refused(f"{module}.{name}") from None
 
-    def persistent_load(self, pid: Any, /) -> Any:
+    def persistent_load(self, pid: Any) -> Any:
         raise _Refused("an object outside the file")
