@@ -88,7 +88,8 @@ def tidy(
         accel_m_s2 = np.full((len(times_s), 3), np.nan)
     elif not np.isfinite(accel_m_s2).all(axis=1).any():
         said.append("no accelerations were read: none of their cells is a number")
-    norm = np.linalg.norm(orientation_wxyz, axis=1)
+    with np.errstate(over="ignore"):  # of numbers beyond every scale, which are left out
+        norm = np.linalg.norm(orientation_wxyz, axis=1)
     whole = np.isfinite(times_s) & np.isfinite(norm)
     usable = whole & (norm > 0.1)
     _note(said, ~whole, "{} rows without time or orientation dropped")
