@@ -217,9 +217,8 @@ class WindowSolver:
                 self._append(observation, start)
             held = self._theta[: self.count].copy()
             held[kept:] = theta[-1]
-            held_cost = self._evaluate(held)
             told = bool(self._measured.present[kept : self.count].any())
-            if not (told and self.refine(max_iterations) <= held_cost):
+            if not (told and self._evaluate(held) >= self.refine(max_iterations)):
                 self._theta[: self.count] = held
                 self.refine(max_iterations)
             return Ahead(self._theta[kept : self.count].copy(), *self.newest_spread())
