@@ -167,3 +167,25 @@ def test_a_person_whom_one_view_shows_twice_is_one(rng):
         scene.owner[frame][0] = np.tile(scene.owner[frame][0], 2)
     _, score = run(Tracker(RIG, BODY25), scene)
     assert len(score.names) == 2 and score.switches == 0 and score.wrong == 0
+
+
+def test_who_stands_beside_a_start_is_not_taken_for_who_begins_there_and_is_found_later(rng):
+    """The subject is detected half a second after somebody 0.8 m from its start."""
+    t = times_s(3.0)
+    people = [walker(straight(place, (0.0, 0.0)), t) for place in ((0.0, 0.0), (0.8, 0.0))]
+    late = lambda person, camera, frame: person == 0 and frame < 15  # noqa: E731
+    scene = observe(RIG, people, rng, hidden=late)
+    tracker = Tracker(RIG, BODY25, None, [Subject(name="anna", start_m=(0.0, 0.0))])
+    history, _ = names_of(tracker, scene)
+    assert {who for here in history for who in here.values()} == {0} and history[30:] == [
+        {"anna": 0}
+    ] * len(history[30:])
+
+
+def test_somebody_alone_within_a_metre_of_a_start_begins_there_after_a_second(rng):
+    t = times_s(3.0)
+    scene = observe(RIG, [walker(straight((0.8, 0.0), (0.0, 0.0)), t)], rng)
+    tracker = Tracker(RIG, BODY25, None, [Subject(name="anna", start_m=(0.0, 0.0))])
+    history, _ = names_of(tracker, scene)
+    assert history[-1] == {"anna": 0}
+    assert 0.9 < next(f for f, here in enumerate(history) if here) / RATE_HZ < 1.3

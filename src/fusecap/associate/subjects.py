@@ -21,6 +21,9 @@ from fusecap.associate.track import Track
 from fusecap.errors import SessionError
 from fusecap.geometry.camera import Rig
 
+_BESIDE_M = 0.5
+"""From a start: somebody whose torso is as far may stand beside who begins there."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Subject:
@@ -71,7 +74,7 @@ class Cast:
         self.kept_out: list[Track] = []
         """Who is established and has no place while a subject is missing."""
         self.undecided: list[Track] = []
-        """Who may be a missing subject, and has not been seen alone yet."""
+        """Who may soon turn out to be a missing subject, or to stand beside who begins there."""
         self.returned: dict[int, tuple[int, int]] = {}
         """At this instant, by the id a newcomer had, whose it has, and when it was born [ns]."""
         self._single = len(rig) == 1
@@ -282,8 +285,14 @@ class Cast:
         cost = np.where(by_looks(away), cost.reshape(len(newcomers), len(known)), np.inf)
         open_s = [o.doubt_s if p.live else 0.0 for p in known]
         silent_s = [(now_ns - p.track.triangulated_ns) * 1e-9 if p.track else 0.0 for p in known]
-        undecided = np.array(silent_s) < np.array(open_s)
-        settled = ~np.isfinite(cost[:, undecided]).any(axis=1)
+        undecided = np.tile(np.array(silent_s) < np.array(open_s), (len(newcomers), 1))
+        if (now_ns - self._begun_ns) * 1e-9 < o.two_view_birth_s:
+            # Who begins there may be found later than who stands beside.
+            begin = np.array([p.track is None for p in known], dtype=bool)
+            beside = begin & np.isfinite(cost) & (cost > _BESIDE_M)
+            self.undecided += [newcomers[n] for n in np.flatnonzero(beside.any(axis=1))]
+            undecided |= beside
+        settled = ~(np.isfinite(cost) & undecided).any(axis=1)
         newcomers = [newcomers[n] for n in np.flatnonzero(settled)]
         cost = np.where(undecided, np.inf, cost)[settled]
         admitted = cheapest(cost)
@@ -380,7 +389,8 @@ class Cast:
         centre = self._anatomy.centre(track.landmarks)
         if place.track is None:
             assert place.start_m is not None
-            away = float(np.hypot(centre[0] - place.start_m[0], centre[2] - place.start_m[1]))
+            first_m = np.where(np.isfinite(track.born_m), track.born_m, centre)
+            away = float(np.hypot(first_m[0] - place.start_m[0], first_m[2] - place.start_m[1]))
             if self._single:
                 return 0.0  # One camera gives no place to compare with.
             return away if away < o.start_radius_m else np.inf
