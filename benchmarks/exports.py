@@ -15,6 +15,7 @@ import resource
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -84,6 +85,18 @@ def _worked_s() -> float:
     return sum(each.ru_utime + each.ru_stime for each in used)
 
 
+def store(minutes: float, path: Path) -> None:
+    save_take(long_take(minutes), path)
+
+
+def in_a_process(work: Callable[..., None], *arguments: object) -> bool:
+    """Of its own, so that its peak memory is its own too; whether it ended well."""
+    child = multiprocessing.get_context("spawn").Process(target=work, args=arguments)
+    child.start()
+    child.join()
+    return child.exitcode == 0
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--minutes", type=float, default=30.0)
@@ -91,14 +104,9 @@ def main() -> None:
     told = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         stored = Path(folder) / "t.npz"
-        save_take(long_take(told.minutes), stored)
+        in_a_process(store, told.minutes, stored)
         for name in told.formats.split(","):
-            child = multiprocessing.get_context("spawn").Process(
-                target=measure, args=(name, stored)
-            )
-            child.start()
-            child.join()
-            if child.exitcode:
+            if not in_a_process(measure, name, stored):
                 print(f"{name:9} failed", file=sys.stderr)
 
 
