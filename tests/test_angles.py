@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 import fusecap
 from angle_signs import MORE_DEG, figures
 from export_people import two_walkers, with_gap
+from fusecap.angles.constants import CONSTANT_DEG
 from fusecap.angles.gait import gait_cycles
 from fusecap.angles.joint_angles import ANY_ANGLE_SD_DEG, joint_angles
 from fusecap.angles.joints import JOINTS
@@ -180,7 +181,7 @@ def test_curves_do_not_jump_by_full_turns_and_gaps_are_nan():
     theta = np.zeros((1, 80, PAPER21.pose_size))
     theta[0, :, 3 + 3 * PAPER21.bone("head") + 1] = np.radians(np.linspace(100, 260, 80))
     take = take_of(theta, [person()], names=("a",))
-    turned, sd = joint_angles(take).curve("a", "neck_rotation")
+    turned, sd = joint_angles(take, constants={}).curve("a", "neck_rotation")
     assert np.abs(np.diff(turned)).max() < 3 and sd.max() == 0
     gappy = joint_angles(with_gap(take, slice(30, 40)))
     nan = np.isnan(gappy.deg[0]).all(axis=1)
@@ -227,6 +228,19 @@ def test_the_error_bar_grows_to_that_of_any_angle_in_the_singular_pose():
     hanging = joint_angles(posed({"left_upper_arm": ("z", -90.0)}, sigma_deg=3.0))
     assert np.isfinite(hanging.deg).all()
     assert hanging.curve("a", "left_arm_flexion")[1][0] < 3
+
+
+def test_a_constant_of_a_joint_is_in_its_bar_also_where_that_grows():
+    turned = posed({"left_upper_arm": ("z", -60.0)}, sigma_deg=3.0)
+    bare, plain = (
+        joint_angles(turned, constants=c)
+        for c in ({"arm": (4.0, 0.0, 0.0), "neck": (0.0, 2.0, 0.0)}, {})
+    )
+    for name, square in (("left_arm_flexion", 16.0), ("neck_bending", 4.0), ("neck_flexion", 0.0)):
+        grown = 1.0 / np.cos(np.radians(30.0)) ** 2 if "arm" in name else 1.0
+        more = bare.curve("a", name)[1] ** 2 - plain.curve("a", name)[1] ** 2
+        assert more == pytest.approx(square * grown, abs=1e-6)
+    assert {joint.name for joint in JOINTS} == {*CONSTANT_DEG}
 
 
 def test_noise_about_hanging_arms_does_not_wind_the_plane_of_elevation_up():

@@ -225,6 +225,13 @@ def test_a_camera_that_shares_no_board_is_named(rng):
         calibrate_rig(truth, found, CHARUCO)
 
 
+def test_a_board_that_is_too_small_to_be_found_is_said_to_be(rng):
+    truth = ring(2)
+    found = [replace(shots, shots=shots.shots[:1]) for shots in rig_shots(truth, rng)]
+    with pytest.raises(CalibrationError, match=r"found in 1 of 'c0', 1 of 'c1' images.*larger"):
+        calibrate_rig(truth, found, CHARUCO)
+
+
 def test_a_checkerboard_that_half_a_turn_does_not_change_is_refused(rng):
     truth = ring(2)
     with pytest.raises(CalibrationError, match="half a turn"):

@@ -3,20 +3,23 @@
 The error of a joint's rotation is taken as that of two bones with independent errors, the same
 about every axis: `bone_sigma_deg` is a root mean square over three axes, so about one axis
 
-    sigma = sqrt((sigma_above² + sigma_below²) / 3)
+    sigma² = (sigma_above² + sigma_below²) / 3 + constant²
 
-The middle angle b turns with this sigma. The first and last turn about axes that b brings
-together, so theirs grow: sigma / |cos b| (Cardan), sigma / |sin b| (globe), up to the 104 deg of an
-angle that may be anything. At the singular pose itself only their sum or difference is known.
+with `constants.CONSTANT_DEG` of the joint and axis. The middle angle b turns with this sigma. The
+first and last turn about axes that b brings together, so theirs grow: sigma / |cos b| (Cardan),
+sigma / |sin b| (globe), up to the 104 deg of an angle that may be anything. At the singular pose
+itself only their sum or difference is known.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from fusecap.angles.constants import CONSTANT_DEG
 from fusecap.angles.joints import GLOBE, JOINTS, MIRROR, AnglesOfJoint, isb_axes
 from fusecap.errors import TakeError, nearest
 from fusecap.take import Take
@@ -49,8 +52,12 @@ class JointAngles:
         return self.deg[at], self.sd_deg[at]
 
 
-def joint_angles(take: Take) -> JointAngles:
+def joint_angles(
+    take: Take, *, constants: Mapping[str, tuple[float, float, float]] = CONSTANT_DEG
+) -> JointAngles:
     """All angles of `JOINTS` whose bones the take has; docs/angles.md has their signs.
+
+    `constants`: per joint, one standard deviation [deg] of what is wrong through a whole take.
 
     Every curve is continuous over the frames in which its subject is tracked and the joint is away
     from its singular pose, and lies within half a turn of 0 in the median. Raises `TakeError` where
@@ -75,12 +82,15 @@ def joint_angles(take: Take) -> JointAngles:
             above, below = (rotation[:, bone] for bone in bones)
             relative = _below_in_above(joint, above, below, mirrored=side == "left")
             turns, slack = _turns(relative, joint.order)
-            sigma = np.sqrt(np.square(sigma_deg[:, bones]).sum(axis=1) / 3)
+            constant = np.square(constants.get(joint.name, (0.0, 0.0, 0.0)))
+            sigma = np.sqrt(np.square(sigma_deg[:, bones]).sum(axis=1)[:, None] / 3 + constant)
             deg[subject, tracked, column] = _followed(
                 np.degrees(turns) * joint.signs, np.flatnonzero(tracked), slack
             )
-            outer = np.minimum(sigma / np.maximum(slack, 1e-9), ANY_ANGLE_SD_DEG)
-            sd_deg[subject, tracked, column] = np.stack([outer, sigma, outer], axis=1)
+            apart = np.stack([slack, np.ones_like(slack), slack], axis=1)
+            sd_deg[subject, tracked, column] = np.minimum(
+                sigma / np.maximum(apart, 1e-9), [ANY_ANGLE_SD_DEG, np.inf, ANY_ANGLE_SD_DEG]
+            )
     return JointAngles(
         time_s=take.time_s,
         subject_names=take.subject_names,

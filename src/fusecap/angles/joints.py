@@ -29,38 +29,22 @@ class AnglesOfJoint:
     above: str
     """A bone without its side."""
     below: str
-    order: str
+    order: str = CARDAN
     """`CARDAN` or `GLOBE`."""
-    angles: tuple[str, str, str]
-    signs: tuple[float, float, float]
+    angles: tuple[str, str, str] = ("flexion", "adduction", "rotation")
+    signs: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Of the turns about the ISB axes, so that what `angles` names is positive."""
     sided: bool = True
 
 
+_BENDING = ("flexion", "bending", "rotation")
+_FIRST_REVERSED = (-1.0, 1.0, 1.0)
+
 JOINTS = (
+    AnglesOfJoint(name="hip", above="hips", below="thigh"),
+    AnglesOfJoint(name="knee", above="thigh", below="shank", signs=_FIRST_REVERSED),
     AnglesOfJoint(
-        name="hip",
-        above="hips",
-        below="thigh",
-        order=CARDAN,
-        angles=("flexion", "adduction", "rotation"),
-        signs=(1.0, 1.0, 1.0),
-    ),
-    AnglesOfJoint(
-        name="knee",
-        above="thigh",
-        below="shank",
-        order=CARDAN,
-        angles=("flexion", "adduction", "rotation"),
-        signs=(-1.0, 1.0, 1.0),
-    ),
-    AnglesOfJoint(
-        name="ankle",
-        above="shank",
-        below="foot",
-        order=CARDAN,
-        angles=("dorsiflexion", "inversion", "rotation"),
-        signs=(1.0, 1.0, 1.0),
+        name="ankle", above="shank", below="foot", angles=("dorsiflexion", "inversion", "rotation")
     ),
     AnglesOfJoint(
         name="shoulder",
@@ -70,46 +54,33 @@ JOINTS = (
         angles=("plane", "elevation", "rotation"),
         signs=(1.0, -1.0, 1.0),
     ),
-    AnglesOfJoint(
-        name="arm",
-        above="spine3",
-        below="upper_arm",
-        order=CARDAN,
-        angles=("flexion", "adduction", "rotation"),
-        signs=(1.0, 1.0, 1.0),
-    ),
+    AnglesOfJoint(name="arm", above="spine3", below="upper_arm"),
     AnglesOfJoint(
         name="elbow",
         above="upper_arm",
         below="forearm",
-        order=CARDAN,
         angles=("flexion", "adduction", "pronation"),
-        signs=(1.0, 1.0, 1.0),
     ),
     AnglesOfJoint(
         name="wrist",
         above="forearm",
         below="hand",
-        order=CARDAN,
         angles=("flexion", "ulnar_deviation", "rotation"),
-        signs=(1.0, 1.0, 1.0),
     ),
     AnglesOfJoint(
         name="trunk",
         above="hips",
         below="spine3",
-        order=CARDAN,
-        angles=("flexion", "bending", "rotation"),
-        signs=(-1.0, 1.0, 1.0),
+        angles=_BENDING,
+        signs=_FIRST_REVERSED,
         sided=False,
     ),
     AnglesOfJoint(
         name="neck",
         above="spine3",
         below="head",
-        order=CARDAN,
-        angles=("flexion", "bending", "rotation"),
-        signs=(-1.0, 1.0, 1.0),
+        angles=_BENDING,
+        signs=_FIRST_REVERSED,
         sided=False,
     ),
 )

@@ -193,15 +193,16 @@ def _print_table(
     columns: Sequence[str],
     row: Row,
 ) -> None:
-    """Failures last, where they are seen."""
+    """Failures last, where they are seen; errors as lines of their own, which no column narrows."""
     well = [path for path in jobs if path in ended and path not in set(failed)]
+    errors = [path for path in failed if "error" in ended[path]]
     table = table_of("", *columns, "s", "")
     for path in (*(well if len(ended) <= _SHOWN else ()), *failed):
         result = ended[path]
-        if "error" in result:
-            cells, word = ["-"] * len(columns), result["error"].splitlines()[0]
-        else:
-            cells, word = row(result), "already" if result.get("already") else ""
-        table.add_row(path, *cells, f"{result['seconds']:.1f}", word)
+        if "error" not in result:
+            word = "already" if result.get("already") else ""
+            table.add_row(path, *row(result), f"{result['seconds']:.1f}", word)
     if table.row_count:
         console.print(table)
+    for path in errors:
+        console.print(f"failed {path}: {ended[path]['error'].splitlines()[0]}", soft_wrap=True)

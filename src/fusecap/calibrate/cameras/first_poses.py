@@ -74,10 +74,14 @@ def check_connected(names: Sequence[str], views: Views) -> None:
         for b in range(a + 1, len(names))
         if (a in linked) != (b in linked)
     )
+    found = [sum(camera == index for camera, _ in views) for index in range(len(names))]
+    told = ", ".join(f"{count} of '{name}'" for name, count in zip(names, found, strict=True))
+    remedy = "hold the board where both see it, or, if they did, check that frames are in step"
+    if min(found) < MIN_SHARED:
+        remedy = "where it was hardly found, come closer or print larger squares; " + remedy
     raise CalibrationError(
         f"{_list(apart)} and {_list(together)} see the board together at fewer than {MIN_SHARED} "
-        f"instants ({counts}): hold the board where both see it, or, if they did, check that "
-        "frames are in step (timestamps)"
+        f"instants ({counts}); it was found in {told} images: {remedy} (timestamps)"
     )
 
 
