@@ -92,7 +92,7 @@ def landmarks_seen(
         away_ns = abs(int(take.timestamps_ns[frame]) - moment.timestamp_ns)
         if away_ns > SAME_INSTANT_NS or not take.tracked[subject, frame]:
             continue
-        instant = _one_frame(take, frame)
+        instant = take.of_frames(frame, frame + 1)
         samples = measure_offsets(rig, landmarks, instant, [moment])
         mine = np.flatnonzero(samples.person == subject)
         if not len(mine):
@@ -313,20 +313,6 @@ def _add_single(
         at = slice(4 * index, 4 * index + 4)
         normal[at, at] += np.einsum("nij,nik->jk", jacobian, weighted)
         gradient[at] += np.einsum("nij,ni->j", weighted, error)
-
-
-def _one_frame(take: Take, frame: int) -> Take:
-    only = slice(frame, frame + 1)
-    return replace(
-        take,
-        timestamps_ns=take.timestamps_ns[only],
-        theta=take.theta[:, only],
-        bone_position_in_world_m=take.bone_position_in_world_m[:, only],
-        bone_rotation_in_world_wxyz=take.bone_rotation_in_world_wxyz[:, only],
-        tracked=take.tracked[:, only],
-        bone_sigma_deg=take.bone_sigma_deg[:, only],
-        position_sigma_m=take.position_sigma_m[:, only],
-    )
 
 
 def held_back(times_s: Float[np.ndarray, " m"], pairs: Pairs) -> Int[np.ndarray, " m"]:
