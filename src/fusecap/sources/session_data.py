@@ -357,8 +357,11 @@ def content_hash(session: Session) -> str:
     for camera in session.cameras:
         if camera.keypoints is not None and camera.keypoints.is_dir():
             with os.scandir(camera.keypoints) as entries:
-                frames = [e for e in entries if e.name.endswith(".json") and e.is_file()]
-                sizes = sorted((e.name, e.stat().st_size) for e in frames)
+                sizes = sorted(
+                    (entry.name, entry.stat().st_size)
+                    for entry in entries
+                    if entry.name.endswith(".json") and entry.is_file()
+                )
             for name, size in sizes:
                 digest.update(f"{name}\0{size}\0".encode())
             record = read_record(camera.keypoints)
