@@ -74,7 +74,7 @@ def score_walker(name: str, take: Take, folder: Path) -> None:
     bones = [f"{side}_{bone}" for side in SIDES for bone in ("thigh", "shank")]
     there &= np.all([np.isfinite(known[f"R_{bone}"]).all(axis=(1, 2)) for bone in bones], axis=0)
     frames, rows = np.unique(nearest[there], return_index=True)
-    take = at_frames(take, frames)
+    take = take.at_frames(frames)
     turns, away = {}, {}
     for bone in bones:
         segment = Rotation.from_matrix(Y_UP_FROM_Z_UP @ known[f"R_{bone}"][there][rows])
@@ -111,16 +111,6 @@ def with_bones(take: Take, turns: Mapping[str, Rotation]) -> Take:
     for bone, turn in turns.items():
         wxyz[0, :, take.bone_names.index(bone)] = to_wxyz(turn)
     return replace(take, bone_rotation_in_world_wxyz=wxyz)
-
-
-def at_frames(take: Take, frames: np.ndarray) -> Take:
-    motion = ("theta", "bone_position_in_world_m", "bone_rotation_in_world_wxyz", "tracked")
-    names = (*motion, "bone_sigma_deg", "position_sigma_m")
-    return replace(
-        take,
-        timestamps_ns=take.timestamps_ns[frames],
-        **{name: getattr(take, name)[:, frames] for name in names},
-    )
 
 
 def script(name: str) -> ModuleType:
