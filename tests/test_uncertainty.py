@@ -63,7 +63,9 @@ def test_error_bars_grow_while_nothing_measures_and_never_beyond_reason():
     assert later[0].bone_deg[0] == 5.0 and later[0].position_m[0] == 0.02
     assert later[0].bone_deg[0] < later[1].bone_deg[0] < later[2].bone_deg[0] == 180.0
     assert later[2].position_m[0] == 10.0
-    worst = sigmas(np.array([np.nan, 1e9, -1e-12]), np.array([np.nan, 1e9, 0.0]), np.ones(3))
+    worst = sigmas(
+        np.array([np.nan, 1e9, -1e-12]), np.array([np.nan, 1e9, 0.0]), np.ones(3), one_view=False
+    )
     assert worst.bone_deg[:2].tolist() == [180.0, 180.0] and worst.bone_deg[2] == pytest.approx(2.5)
     assert worst.position_m[:2].tolist() == [10.0, 10.0]
 

@@ -410,6 +410,16 @@ def test_poses_ahead_that_went_astray_do_not_keep_each_other_there(rng):
     np.testing.assert_array_equal(window.pose(), held)
 
 
+@pytest.mark.parametrize(
+    ("cameras", "sites", "alone"),
+    [(1, ImuSites.none(), True), (2, ImuSites.none(), False), (1, SITES, False)],
+)
+def test_places_by_one_view_alone_are_less_certain(cameras, sites, alone):
+    truth = walk(3)
+    window = filled(solver(cameras, sites), truth, observations(truth, cameras, sites))
+    assert window.by_one_view() == window.by_one_view(2) == alone
+
+
 def test_a_gap_ends_a_motion_and_begins_another(rng):
     truth, pose_solver = walk(40), solver()
     seen = observations(truth, noise_px=4.0, rng=rng)

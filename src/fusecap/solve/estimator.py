@@ -136,6 +136,7 @@ class Estimator:
         self.found_anew_since_ns: int | None = None
         """Of the last instant: since when the replaced pose had not fitted; None: it was not."""
         self._views = np.zeros(len(rig), dtype=bool)
+        self._one_view = False
         self._solution: Solution | None = None
         self._previous: Observation | None = None
         self._sites: list[np.ndarray] = []
@@ -238,7 +239,9 @@ class Estimator:
         solve_s = time.perf_counter() - started
         self._remember(observation, solution)
         if not seeding:
-            self._sigmas = sigmas(*self._spread(), self._turn_shares)
+            self._one_view = np.count_nonzero(views) == 1 and not has_imu
+            spread = self._spread()
+            self._sigmas = sigmas(*spread, self._turn_shares, one_view=self._one_view)
         self._views = views
         estimate = self._estimate(
             observation.timestamp_ns,
@@ -306,7 +309,7 @@ class Estimator:
         theta = found.theta[-1].copy()
         wrap_pose(theta)
         position, rotation = self.solver.posed(theta)
-        bars = sigmas(found.turn_rad2, found.place_m2, self._turn_shares)
+        bars = sigmas(found.turn_rad2, found.place_m2, self._turn_shares, one_view=self._one_view)
         return replace(
             self._estimate(
                 observation.timestamp_ns,

@@ -36,6 +36,9 @@ _TURN_DEG = 2.5
 _PLACE_SHARE = 0.12
 _PLACE_M = 0.016
 """Of where a rig stands in the world, and the same landmarks."""
+_ONE_VIEW = 4.7
+"""Times that share where one camera and no sensor sees somebody: sizes, which tell the depth then,
+err alike for long."""
 _MOST_DEG, _MOST_M = 180.0, 10.0
 _GROWTH_DEG_S, _GROWTH_M_S = 90.0, 1.0
 """How fast somebody whom nothing measures may be elsewhere by now."""
@@ -66,10 +69,16 @@ def sigmas(
     turn_rad2: Float[np.ndarray, "*n b"],
     place_m2: Float[np.ndarray, "*n b"],
     shares: Float[np.ndarray, " b"],
+    *,
+    one_view: bool,
 ) -> Sigmas:
-    """Of the traces of `kernels.uncertainty.spread`; NaN there is as uncertain as can be."""
+    """Of the traces of `kernels.uncertainty.spread`; NaN there is as uncertain as can be.
+
+    `one_view`: nothing but one camera told where somebody is.
+    """
     turn = np.degrees(np.sqrt(shares * np.maximum(turn_rad2, 0.0) + np.radians(_TURN_DEG) ** 2))
-    place = np.sqrt(_PLACE_SHARE * np.maximum(place_m2, 0.0) + _PLACE_M**2)
+    share = _PLACE_SHARE * (_ONE_VIEW if one_view else 1.0)
+    place = np.sqrt(share * np.maximum(place_m2, 0.0) + _PLACE_M**2)
     return Sigmas(np.fmin(turn, _MOST_DEG), np.fmin(place, _MOST_M))
 
 

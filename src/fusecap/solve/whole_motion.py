@@ -69,10 +69,11 @@ class WholeMotion:
         if window.count > 2:
             window.refine(_MAX_STEPS, _TOLERANCE)
         spreads = (_LATER * spread for spread in window.spreads(count))
-        settled = [
-            Settled(window.pose(window.count - 1 - row), sigmas(turn, place, self._turn_shares))
-            for row, (turn, place) in enumerate(zip(*spreads, strict=True))
-        ]
+        settled = []
+        for row, (turn, place) in enumerate(zip(*spreads, strict=True)):
+            back = window.count - 1 - row
+            bars = sigmas(turn, place, self._turn_shares, one_view=window.by_one_view(back))
+            settled.append(Settled(window.pose(back), bars))
         window.fold(count)
         self._told = window.count
         return settled

@@ -257,6 +257,12 @@ class WindowSolver:
         wrap_pose(theta)
         return theta
 
+    def by_one_view(self, back: int = 0) -> bool:
+        """Whether one camera and no sensor told of the instant `back` before the newest."""
+        row, measured = self.count - 1 - back, self._measured
+        views = (measured.keypoints[row, :, :, 2] > 0.0).any(axis=1)
+        return bool(views.sum() == 1 and not measured.present[row].any())
+
     def newest_spread(self) -> tuple[Float[np.ndarray, " b"], Float[np.ndarray, " b"]]:
         """Traces [rad², m²] of what is known of the newest instant's bones and joints.
 
