@@ -239,7 +239,7 @@ class Estimator:
         solve_s = time.perf_counter() - started
         self._remember(observation, solution)
         if not seeding:
-            self._one_view = np.count_nonzero(views) == 1 and not has_imu
+            self._one_view = bool(np.count_nonzero(views) == 1) and not has_imu
             spread = self._spread()
             self._sigmas = sigmas(*spread, self._turn_shares, one_view=self._one_view)
         self._views = views
