@@ -105,7 +105,7 @@ def fitted(
 def solved(sequence: TwinSequence, cameras: int, imus: int) -> tuple[Take, Take]:
     """As solved, and the truth."""
     simulation = twin_simulation(sequence, cameras=cameras, imus=imus)
-    return solve_simulation(simulation).take, simulation.truth
+    return solve_simulation(simulation).whole_take, simulation.truth
 
 
 def main() -> None:

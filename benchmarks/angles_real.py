@@ -40,7 +40,7 @@ def gait(folder: Path) -> None:
     example = script("gait_imu_only")
     with tempfile.TemporaryDirectory() as out:
         session = load_session(example.write_session(folder, Path(out)))
-        take = solve_session(open_session(session), anyway=True).take
+        take = solve_session(open_session(session), anyway=True).whole_take
     vicon = example.read_vicon(folder / "vicon_first_400.csv").rotation
     first, end = example.CALIBRATION_FRAMES, len(vicon["hips"])
     take = take.of_frames(first, end)
@@ -58,7 +58,7 @@ def walker(folder: Path) -> None:
         ("sensors", session.model_copy(update={"cameras": ()})),
         ("both", session),
     ):
-        score_walker(name, solve_session(open_session(measured), anyway=True).take, folder)
+        score_walker(name, solve_session(open_session(measured), anyway=True).whole_take, folder)
 
 
 def score_walker(name: str, take: Take, folder: Path) -> None:

@@ -213,7 +213,7 @@ def errors(simulation: Simulation, landmarks: LandmarkSet) -> Errors:
         return body
 
     unknown, known = measured({}), measured({"anna": truth.height_m})
-    take = solve_instants(_setup(simulation, landmarks, None), instants).take
+    take = solve_instants(_setup(simulation, landmarks, None), instants).whole_take
     true = _lengths(truth)
     return Errors(
         unknown=_lengths(unknown.shape) - true,

@@ -85,7 +85,7 @@ def pose2sim(folder: Path) -> Recording:
 
 
 def _recording(data: SessionData, *, frames: slice) -> Recording:
-    take = solve_session(data).take
+    take = solve_session(data).whole_take
     if data.landmarks is None:
         raise SystemExit("the recording has no keypoints")
     instants = np.arange(len(take.timestamps_ns))[frames]

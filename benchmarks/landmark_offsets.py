@@ -139,7 +139,7 @@ def shelf(folder: Path, first: int = 150, end: int = 301) -> None:
 
         def take(landmarks: LandmarkSet, first: int, end: int) -> Take:
             setup = setup_of(data.session, data.rig, landmarks)
-            return solve_instants(setup, SessionInstants(data, first, end)).take
+            return solve_instants(setup, SessionInstants(data, first, end)).whole_take
 
         found = self_calibrate(
             lambda landmarks: take(landmarks, first, end),

@@ -67,7 +67,7 @@ def simulated(seeds: int, deg: float, cm: float, seconds: float) -> None:
         found = refine_from_people(data)
         elapsed_s = time.perf_counter() - started
         errors = [
-            score_take(solve_session(replace(data, rig=rig)).take, scene.truth)
+            score_take(solve_session(replace(data, rig=rig)).whole_take, scene.truth)
             for rig in (rough, found.rig, scene.rig)
         ]
         before, after = _off(rough, scene.rig), _off(found.rig, scene.rig)

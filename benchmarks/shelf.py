@@ -51,7 +51,7 @@ def write_shelf_session(folder: Path, target: Path, *, frames: int, floor: bool)
 def solve_shelf(folder: Path, *, frames: int, floor: bool) -> Take:
     with tempfile.TemporaryDirectory() as target:
         path = write_shelf_session(folder, Path(target), frames=frames, floor=floor)
-        return solve_session(open_session(load_session(path))).take
+        return solve_session(open_session(load_session(path))).whole_take
 
 
 def table(score: ShelfScore) -> str:

@@ -141,7 +141,7 @@ def imus(seeds: int, training: bool) -> None:
     for sequence in twin_training_sequences() if training else twin_sequences():
         for seed in range(100, 100 + seeds):
             simulation = capture(sequence.key, sequence.shape, sequence.theta, seed)
-            solved = solve_simulation(simulation.subset(imu_bones=())).take
+            solved = solve_simulation(simulation.subset(imu_bones=())).whole_take
             wrong_s = float(rng.uniform(-2, 2))
             sensors = worn(simulation, wrong_s)
             found = imu_clock(sensors, filmed(solved), max_offset_s=3.0)
@@ -188,7 +188,7 @@ def drift(seeds: int) -> None:
     theta = chained(every)
     for seed in range(100, 100 + seeds):
         simulation = capture("all", every[0].shape, theta, seed)
-        solved = solve_simulation(simulation.subset(imu_bones=())).take
+        solved = solve_simulation(simulation.subset(imu_bones=())).whole_take
         sensors = worn(simulation, 0.5, DRIFT_PPM)
         found = imu_clock(sensors, filmed(solved), max_offset_s=3.0)
         best = imu_clock(sensors, filmed(simulation.truth), max_offset_s=3.0)

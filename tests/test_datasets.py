@@ -318,7 +318,7 @@ def test_shelf_is_evaluated_from_its_folder(data_dir, tmp_path, monkeypatch, cap
     truth = shelf.load_shelf_truth(tmp_path)
     recording = shelf.load_shelf(tmp_path)
     first = replace(truth, points_in_world_m=truth.points_in_world_m[:, :40])
-    score = score_people(recording.solve().take, first)
+    score = score_people(recording.solve(), first)
     assert score.pcp > 93.0
     code, _ = command(monkeypatch, capsys, "evaluate", "shelf", tmp_path, "--out", tmp_path / "o")
     assert code == 0
@@ -422,7 +422,7 @@ def test_dip_comes_in_our_conventions(tmp_path, flat):
     (model,) = recording.subjects
     measured = recording.readings(7)["05"].bone_rotation_in_world
     assert np.allclose(measured, rotation[7, list(model.sites.bone)])
-    score = score_truth(recording.solve().take, recording.truth, recording.rate_hz)
+    score = score_truth(recording.solve(), recording.truth, recording.rate_hz)
     assert score.found_share == 1.0
     assert score.orientation_error_deg.mean < 12.0
     assert score.position_error_mm.count == 0

@@ -10,12 +10,23 @@ import numpy as np
 import pytest
 
 import fusecap
+from fusecap.batch import sorting
 from fusecap.batch.replay import solve_as_live
 from fusecap.batch.second_solve import recorded_inputs
-from fusecap.batch.solve import solve_instants
+from fusecap.batch.solve import SessionInstants, solve_instants
+from fusecap.calibrate import offsets, shape
+from fusecap.calibrate.cameras import people
+from fusecap.calibrate.imus import session as imus
+from fusecap.calibrate.sync import session as sync
+from fusecap.cli import evaluate_datasets
+from fusecap.evaluate import cells
+from fusecap.evaluate.datasets.recording import DatasetSequence
 from fusecap.interrupts import ctrl_c_held
 from fusecap.recording.reader import Recording
+from fusecap.setup import setup_of
 from fusecap.solve import whole_motion
+from fusecap.sources.session_data import open_session
+from fusecap.sources.session_file import load_session
 from recorded_run import record, simulated_run
 
 SOURCE = Path(fusecap.__file__).parent
@@ -153,3 +164,57 @@ def test_ctrl_c_in_a_replay_leaves_the_first_instants(run):
     rows = len(solved.take.timestamps_ns)
     assert 0 < rows < len(whole.take.timestamps_ns)
     assert np.array_equal(solved.take.theta, whole.take.theta[:, :rows], equal_nan=True)
+
+
+@pytest.fixture
+def pressing_while_sorting(monkeypatch):
+    """Ctrl-C once the second instant has been sorted."""
+    step, told = sorting.Pipeline.step, count()
+
+    def pressed(*arguments):
+        if next(told) == 1:
+            press()
+        return step(*arguments)
+
+    monkeypatch.setattr(sorting.Pipeline, "step", pressed)
+
+
+def measure_shape(data):
+    setup = setup_of(data.session, data.rig, data.landmarks)
+    shape.measure_bodies(setup, SessionInstants(data), heights_m={})
+
+
+def check_cameras(data):
+    seen = [(row, data.detections(row)) for row in range(4)]
+    split = people.Split.of(data, [row for row, _ in seen])
+    people._skeleton(
+        people.Rounds(data=data, detections=seen, split=split, progress=None), data.rig
+    )
+
+
+def solve_dataset(data):
+    nobody = tuple({} for _ in data.rig.cameras)
+    rig, landmarks = data.rig, data.landmarks
+    rate = {"rate_hz": 50.0, "frames": 4}
+    DatasetSequence(name="", rig=rig, landmarks=landmarks, views=nobody, **rate).solve()
+
+
+@pytest.mark.parametrize(
+    "goes_on",
+    [
+        measure_shape,
+        check_cameras,
+        solve_dataset,
+        offsets.calibrate_session,
+        lambda data: sync._filmed_take(data.session, data.keypoints, None),
+        lambda data: imus.seen_by_cameras(data.session, data),
+        lambda data: evaluate_datasets.session(data.session.path),
+        lambda data: cells.solve_cell(cells.TwinCell(scene="S1 FS3")),
+    ],
+    ids=["shape", "cameras", "dataset", "offsets", "sync", "imus", "evaluate session", "cell"],
+)
+def test_nobody_goes_on_with_a_part_of_a_take(goes_on, run, monkeypatch, pressing_while_sorting):
+    monkeypatch.setattr(offsets, "MIN_SAMPLES", 4)
+    data = open_session(load_session(run.path.with_name("session")))
+    with pytest.raises(KeyboardInterrupt):
+        goes_on(data)

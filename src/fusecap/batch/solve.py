@@ -103,6 +103,13 @@ class Solved:
         return self.builder.build(self._provenance)
 
     @property
+    def whole_take(self) -> Take:
+        """The take, for whom a part of it will not do; Ctrl-C that cut it off is raised here."""
+        if self.report.interrupted:
+            raise KeyboardInterrupt
+        return self.take
+
+    @property
     def is_empty(self) -> bool:
         """Nobody was followed."""
         return not any(told["tracked_share"] for told in self.report.subjects.values())

@@ -215,7 +215,7 @@ def calibrate_session(
 
     def solve(landmarks: LandmarkSet, end: int) -> Take:
         setup = setup_of(data.session, data.rig, landmarks)
-        return solve_instants(setup, SessionInstants(data, 0, end), progress=progress).take
+        return solve_instants(setup, SessionInstants(data, 0, end), progress=progress).whole_take
 
     if truth is not None:
         samples = measure_offsets(rig, landmarks, truth, train)

@@ -141,10 +141,10 @@ def calibrate_shape(
     )
     rest = part(trained, instants)
     held_out = [rest.detections(instant) for instant in range(len(rest))]
-    before = solve_instants(setup, rest, progress=progress).take
+    before = solve_instants(setup, rest, progress=progress).whole_take
     shapes = {body.name: body.shape for body in bodies}
     measured = replace(setup, subjects=_models(setup, before, shapes))
-    after = solve_instants(measured, rest, progress=progress).take
+    after = solve_instants(measured, rest, progress=progress).whole_take
     return ShapeCalibration(
         bodies=bodies,
         held_out_before_px=reprojection_error_px(setup.rig, setup.landmarks, before, held_out),
@@ -161,7 +161,7 @@ def measure_bodies(
     progress: Progress | None = None,
 ) -> tuple[MeasuredBody, ...]:
     """Alternates solves and fits over all these instants."""
-    take = solve_instants(setup, instants, progress=progress).take
+    take = solve_instants(setup, instants, progress=progress).whole_take
     if subject is not None and subject not in take.subject_names:
         raise InputError(
             f"no '{subject}' was found in the session{nearest(subject, take.subject_names)}"
@@ -171,7 +171,7 @@ def measure_bodies(
         if round_:
             shapes = {name: body.shape for name, body in bodies.items()}
             setup = replace(setup, subjects=_models(setup, take, shapes))
-            take = solve_instants(setup, instants, progress=progress).take
+            take = solve_instants(setup, instants, progress=progress).whole_take
         for index, name in enumerate(take.subject_names):
             if subject is not None and name != subject:
                 continue

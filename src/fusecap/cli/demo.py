@@ -64,6 +64,7 @@ def demo(
         simulated_session.write_session(simulation, write_session)
     with progress(quiet=as_json) as show:
         solved = solve_simulation(simulation, associate=associate, progress=show)
+        take = solved.whole_take
         live = live_takes(simulation, associate=associate, lag_s=LAG_S, progress=show)
     files = write_take(
         solved,
@@ -71,8 +72,8 @@ def demo(
         Exports(formats=["bvh"]),
         picture=True,
     )
-    score = score_take(solved.take, simulation.truth)
-    newest, settled = (score_take(take, simulation.truth) for take in live)
+    score = score_take(take, simulation.truth)
+    newest, settled = (score_take(each, simulation.truth) for each in live)
     result = {
         "simulated": True,
         **main_figures(score),
@@ -111,7 +112,7 @@ def demo(
         print_speed(solved)
     finish(solved, files, as_json)
     if view:
-        _show(solved.take, simulation)
+        _show(take, simulation)
 
 
 def _show(take: Take, simulation: Simulation) -> None:

@@ -61,8 +61,9 @@ def session(
     known = load_take(truth or loaded.folder / "truth.npz")
     with progress(quiet=as_json) as show:
         solved = solve_session(open_session(loaded, show), progress=show)
+        take = solved.whole_take
     _notes(solved.report.notes, as_json)
-    score = score_take(solved.take, known)
+    score = score_take(take, known)
     simulated = bool(known.provenance.get("simulated"))
     table = session_table(score, loaded.settings.name, simulated=simulated)
     _report(table, out, "session", as_json, main_figures(score))
@@ -134,8 +135,8 @@ def shelf(folder: Folder, out: Out = _OUT, as_json: Json = False) -> None:
     truth = load_shelf_truth(folder)
     recording = load_shelf(folder)
     with progress(quiet=as_json) as show:
-        solved = recording.solve(show)
-    _report(pcp_table(recording.name, score_people(solved.take, truth)), out, "shelf", as_json)
+        take = recording.solve(show)
+    _report(pcp_table(recording.name, score_people(take, truth)), out, "shelf", as_json)
 
 
 def panoptic(folder: Folder, out: Out = _OUT, as_json: Json = False) -> None:
@@ -153,9 +154,9 @@ def _scores(recordings: Iterable[DatasetSequence], as_json: bool) -> list[tuple[
     for recording in recordings:
         assert recording.truth is not None
         with progress(quiet=as_json) as show:
-            solved = recording.solve(show)
+            take = recording.solve(show)
         _notes(recording.notes, as_json)
-        score = score_truth(solved.take, recording.truth, recording.rate_hz)
+        score = score_truth(take, recording.truth, recording.rate_hz)
         scores.append((recording.name, score))
     return scores
 

@@ -75,13 +75,14 @@ def solve_cell(cell: TwinCell) -> dict[str, Any]:
     simulation = simulation_of(cell)
     options = SolverOptions(weights=Weights.named(**cell.weights))
     solved = solve_simulation(simulation, options=options, associate=cell.associate)
+    take = solved.whole_take
     # One person is who they are, however far away the estimate has drifted.
     gate_m = np.inf if len(simulation.people) == 1 else 0.5
-    score = score_take(solved.take, simulation.truth, gate_m=gate_m)
+    score = score_take(take, simulation.truth, gate_m=gate_m)
     result = {
         "score": asdict(score),
-        "floor": below_floor(solved.take),
-        "joints17": _over_17_joints(solved.take, simulation.truth),
+        "floor": below_floor(take),
+        "joints17": _over_17_joints(take, simulation.truth),
         "solve_ms_median": solved.report.solve_ms_median,
         "solve_ms_p99": solved.report.solve_ms_p99,
         "frames": solved.report.instants,
@@ -94,11 +95,11 @@ def solve_cell(cell: TwinCell) -> dict[str, Any]:
         result["seen"] = asdict(score_take(seen, simulation.truth, gate_m=gate_m))
         result["ahead"] = asdict(score_take(ahead, simulation.truth, gate_m=gate_m))
     if cell.trace:
-        result["root_m"] = np.round(solved.take.theta[0, :, :3], 5).tolist()
+        result["root_m"] = np.round(take.theta[0, :, :3], 5).tolist()
         result["true_root_m"] = np.round(simulation.truth.theta[0, :, :3], 5).tolist()
         wrist = simulation.truth.bone_names.index("right_hand")
-        for name, take in (("wrist_m", solved.take), ("true_wrist_m", simulation.truth)):
-            place = take.bone_position_in_world_m[0, :, wrist]
+        for name, moved in (("wrist_m", take), ("true_wrist_m", simulation.truth)):
+            place = moved.bone_position_in_world_m[0, :, wrist]
             result[name] = np.round(place, 5).tolist()
     return plain(result)
 

@@ -265,7 +265,7 @@ def _skeleton(rounds: Rounds, rig: Rig) -> dict[str, float]:
     """Median held-out distance [px] from solved landmarks per camera; "all" is their median."""
     setup = setup_of(rounds.data.session, rig, rounds.data.landmarks)
     instants = _Listed(rounds.data, rounds.detections)
-    take = solve_instants(setup, instants, progress=rounds.progress).take
+    take = solve_instants(setup, instants, progress=rounds.progress).whole_take
     held_out = [
         moment
         for (instant, _), (_, moment) in zip(rounds.detections, rounds.detections, strict=True)

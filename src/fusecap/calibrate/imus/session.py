@@ -66,10 +66,7 @@ def seen_by_cameras(
         raise InputError(
             f"{session.path}: the cameras' videos have no keypoints yet; run: fusecap detect"
         )
-    solved = solve_session(data, progress=progress)
-    if solved.report.interrupted:
-        raise KeyboardInterrupt
-    return solved.take
+    return solve_session(data, progress=progress).whole_take
 
 
 def references(

@@ -240,4 +240,4 @@ def _filmed_take(
         findings=(),
         content_hash="",
     )
-    return solve_session(data, progress=progress, anyway=True).take
+    return solve_session(data, progress=progress, anyway=True).whole_take

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fusecap.associate.options import TrackerOptions
-from fusecap.batch.solve import Solved, solve_instants
+from fusecap.batch.solve import solve_instants
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.body.pose import landmarks_in_world
 from fusecap.body.prior import load_prior
@@ -136,8 +136,8 @@ class DatasetSequence:
         """By subject name, what its sensors say."""
         return {name: readings[instant] for name, readings in self.imu.items()}
 
-    def solve(self, progress: Progress | None = None) -> Solved:
-        """The default solve."""
+    def solve(self, progress: Progress | None = None) -> Take:
+        """The take of the default solve."""
         weights = Weights() if self.floor else Weights(floor=0.0)
         setup = Setup(
             rig=self.rig,
@@ -149,7 +149,7 @@ class DatasetSequence:
             prior=load_prior(self.skeleton),
             options=SolverOptions(weights=weights),
         )
-        return solve_instants(setup, self, progress=progress, notes=self.notes)
+        return solve_instants(setup, self, progress=progress, notes=self.notes).whole_take
 
 
 def read_views(
