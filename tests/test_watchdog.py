@@ -11,10 +11,11 @@ from fusecap.evaluate.demo_scene import demo_scene
 from fusecap.evaluate.score import score_take
 from fusecap.evaluate.simulated_solve import setup_of_simulation, solve_simulation
 from fusecap.geometry.quaternions import from_wxyz
-from fusecap.pipeline import Pipeline
+from fusecap.pipeline import Pipeline, make_estimator
 from fusecap.solve import watchdog
 from fusecap.solve.estimator import Estimator
 from fusecap.solve.watchdog import FITS, POOR, Watchdog
+from fusecap.types import Observation
 
 FRAME_NS = 16_666_667
 LIMBS = np.array([name.endswith(("arm", "thigh", "shank")) for name in PAPER21.bone_names])
@@ -118,3 +119,45 @@ def test_a_moment_of_bad_keypoints_and_none_at_all_is_no_doubt():
     assert not any(
         dog.doubts(cost * max(seen, 1), seen, t * FRAME_NS) for t, (cost, seen) in enumerate(costs)
     )
+
+
+def test_one_cost_that_is_no_number_blinds_nobody():
+    dog = Watchdog()
+    costs = [(0.015, 25)] * 60 + [(np.nan, 25)] + [(0.015, 25)] * 60
+    assert not any(
+        dog.doubts(cost * seen, seen, t * FRAME_NS) for t, (cost, seen) in enumerate(costs)
+    )
+    assert any(dog.doubts(4.0 * POOR * 25, 25, t * FRAME_NS) for t in range(121, 181))
+
+
+def test_a_trial_comes_as_soon_before_time_zero_as_after_and_is_told_from_there():
+    def trials(start_ns):
+        dog, found = Watchdog(), []
+        for t in range(60):
+            if dog.doubts((4.0 if t > 30 else 0.1) * POOR * 25, 25, start_ns + t * FRAME_NS):
+                found.append((t, dog.tried(True, start_ns + t * FRAME_NS) - start_ns))
+        return found
+
+    assert trials(-(10**12)) == trials(-30 * FRAME_NS) == trials(-31 * FRAME_NS) == trials(10**12)
+    assert trials(0)
+
+
+@pytest.mark.parametrize("off_px", [14.0, 20.0])
+def test_a_pose_that_fits_badly_is_not_replaced_by_itself(off_px):
+    """As with a bad calibration: every keypoint lies somewhere else, always by the same."""
+    simulation = demo_scene(seconds=1.0)
+    simulation = simulation.subset(cameras=simulation.rig.names[:1], imu_bones=())
+    setup = setup_of_simulation(simulation)
+    estimator = make_estimator(setup, setup.subjects[0])
+    off = np.random.default_rng(3).normal(size=(1, 25, 2))
+    off *= off_px / np.linalg.norm(off, axis=2, keepdims=True)
+    costs = []
+    for t, detections in enumerate(simulation.detections):
+        row = int(np.flatnonzero(simulation.detected_person[t][0] == 0)[0])
+        keypoints = detections.people[0][row][None].copy()
+        keypoints[..., :2] += off
+        seen = Observation(timestamp_ns=detections.timestamp_ns, keypoints=keypoints)
+        estimate = estimator.follow(0, seen)
+        costs.append(estimate.cost / np.count_nonzero(keypoints[:, :, 2]))
+    assert np.mean(costs[20:]) > POOR
+    assert estimator.found_anew == 0

@@ -245,8 +245,10 @@ class Cast:
             if misfit < FITS:
                 place.misfit_since_ns, place.told = None, False
             elif np.isfinite(misfit):
-                since_ns = place.misfit_since_ns = place.misfit_since_ns or now_ns
-                if (now_ns - since_ns) * 1e-9 >= self._options.patience_s and not place.told:
+                if place.misfit_since_ns is None:
+                    place.misfit_since_ns = now_ns
+                for_s = (now_ns - place.misfit_since_ns) * 1e-9
+                if for_s >= self._options.patience_s and not place.told:
                     place.told = True
                     found.append(place.name)
         return found

@@ -174,7 +174,8 @@ class Engine:
         for name, continuity in self._people.items():
             estimate = solved.get(name)
             views = 0 if estimate is None else min(int(estimate.views.sum()), 2)
-            silent_ns = now_ns - (continuity.measured_ns or now_ns)
+            heard_ns = continuity.measured_ns
+            silent_ns = 0 if heard_ns is None else now_ns - heard_ns
             people[name] = continuity.update(estimate, (views, name in readings), now_ns)
             self._watch(name, continuity.measured_ns == now_ns, silent_ns * 1e-9)
         return LiveStep(

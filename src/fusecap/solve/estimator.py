@@ -217,8 +217,8 @@ class Estimator:
         if self._solution is None:
             solution = self._first(observation, data, landmarks_in_world_m, self.model.start_m)
         elif views.any() or has_imu:
-            data = self._weighed(data, self._solution.theta)
-            near = self.solver.solve(self._solution.theta, data)
+            theta = self._solution.theta
+            near = self.solver.solve(theta, self._weighed(data, theta))
             solution = self._watched(observation, data, landmarks_in_world_m, near)
             if solution is not near:
                 self._begin_motion()
@@ -339,6 +339,7 @@ class Estimator:
         motion.stand(motion.count - 1 - _NEAR, _NEAR)
         motion.refine(_MAX_STEPS)
         theta = motion.pose()
+        data = self._weighed(data, alone.theta)
         seen = np.count_nonzero(observation.keypoints[:, :, 2] > 0)
         allowed = _LOST_FACTOR * max(alone.cost, _POOR_COST_PER_KEYPOINT * max(seen, 1))
         if not self.solver.cost(theta, data) < allowed:
@@ -368,7 +369,10 @@ class Estimator:
         points: np.ndarray,
         place_m: tuple[float, float] | None,
     ) -> Solution | None:
-        """From nothing but this instant, and where (x, z) somebody is, if that is known."""
+        """From nothing but this instant, and where (x, z) somebody is, if that is known.
+
+        `data` are as measured, not weighed: each start has its own distances.
+        """
         shape, prior, sites = self.solver.shape, self._prior, self.model.sites
         starts = []
         from_points = pose_from_landmarks(
@@ -403,9 +407,9 @@ class Estimator:
         x_m, z_m = found.theta[[0, 2]].tolist()
         other = self._first(observation, data, points, (x_m, z_m))
         # The solver's posed body and matrices belong to its last solve, but results are copies.
-        since_ns = self._watchdog.tried(
-            other is not None and other.cost < FITS * found.cost, now_ns
-        )
+        # A cost that is no number fits nothing.
+        fits = other is not None and not other.cost >= FITS * found.cost
+        since_ns = self._watchdog.tried(fits, now_ns)
         if other is None or since_ns is None:
             return found
         self.found_anew_since_ns = since_ns

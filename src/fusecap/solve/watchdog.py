@@ -34,7 +34,7 @@ class Watchdog:
         self._last_ns: int | None = None
         self._sound_ns: int | None = None
         self._wait_s = _FIRST_TRIAL_S
-        self._next_ns = 0
+        self._next_ns: int | None = None
 
     def doubts(self, cost: float, keypoints: int, now_ns: int) -> bool:
         """Whether the pose should be found anew now, for a comparison."""
@@ -43,11 +43,12 @@ class Watchdog:
         elapsed_s = 0.0 if self._last_ns is None else (now_ns - self._last_ns) * 1e-9
         self._last_ns = now_ns
         share = -math.expm1(-elapsed_s / _MEAN_S)
-        self._mean += share * (min(cost / keypoints, _MOST) - self._mean)
+        told = min(cost / keypoints, _MOST) if cost < math.inf else _MOST
+        self._mean += share * (told - self._mean)
         if self._mean <= POOR or self._sound_ns is None:
             self._sound_ns = now_ns
             self._wait_s = _FIRST_TRIAL_S
-        return self._mean > POOR and now_ns >= self._next_ns
+        return self._mean > POOR and (self._next_ns is None or now_ns >= self._next_ns)
 
     def tried(self, fits: bool, now_ns: int) -> int | None:
         """What a trial gave. Where it fits, since when [ns] the pose before was wrong."""
@@ -56,6 +57,7 @@ class Watchdog:
             self._wait_s = min(2.0 * self._wait_s, _LAST_TRIAL_S)
             return None
         # The mean lags behind.
-        since_ns = (self._sound_ns or now_ns) - round(_MEAN_S * 1e9)
+        sound_ns = now_ns if self._sound_ns is None else self._sound_ns
+        since_ns = sound_ns - round(_MEAN_S * 1e9)
         self._mean, self._sound_ns, self._wait_s = 0.0, now_ns, _FIRST_TRIAL_S
         return since_ns
