@@ -11,7 +11,9 @@ import pytest
 
 import fusecap
 from fusecap.batch import sorting
+from fusecap.batch.assignments import Assignments
 from fusecap.batch.replay import solve_as_live
+from fusecap.batch.second_pass import SecondPass
 from fusecap.batch.second_solve import recorded_inputs
 from fusecap.batch.solve import SessionInstants, solve_instants
 from fusecap.calibrate import offsets, shape
@@ -51,8 +53,9 @@ def test_a_second_ctrl_c_ends_at_once():
     with ctrl_c_held() as stop:
         press()
         assert stop.asked
-        with pytest.raises(KeyboardInterrupt):
+        with ctrl_c_held() as inner, pytest.raises(KeyboardInterrupt):
             press()
+        assert inner is stop
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
@@ -125,7 +128,7 @@ class Pressing:
 
 
 SECOND = ("batch/second_pass", "solve/whole_motion")
-BEFORE = ("__init__", "__len__", "sort_instants")
+BEFORE = ("__init__", "__len__")
 """Where nothing is solved yet and nothing is kept."""
 FIRST = ("batch/sorting", "batch/assignments")
 
@@ -140,9 +143,9 @@ def test_ctrl_c_between_any_two_lines_leaves_the_first_instants_whole(run, modul
     for line in np.linspace(1, whole_run.lines, 6).astype(int):
         with Pressing(modules, line) as pressed:
             solved = solve_instants(setup, instants)
-        assert solved.report.interrupted, line
         assert pressed.lines >= line
         take, count = solved.take, len(solved.take.timestamps_ns)
+        assert solved.report.interrupted == (count < len(whole.timestamps_ns)), line
         assert (take.timestamps_ns == whole.timestamps_ns[:count]).all()
         known = take.tracked & whole.tracked[: len(take.tracked), :count]
         off_m = take.theta[..., :3] - whole.theta[: len(take.theta), :count, :3]
@@ -218,3 +221,31 @@ def test_nobody_goes_on_with_a_part_of_a_take(goes_on, run, monkeypatch, pressin
     data = open_session(load_session(run.path.with_name("session")))
     with pytest.raises(KeyboardInterrupt):
         goes_on(data)
+
+
+def test_the_second_ctrl_c_ends_a_solve_in_whichever_pass_it_comes(run, pressing_while_sorting):
+    solved = []
+
+    def press_again(what, done, _total):
+        if what == "solving what is sorted":
+            solved.append(done)
+            press()
+
+    with pytest.raises(KeyboardInterrupt):
+        solve_instants(*recorded_inputs(run), progress=press_again)
+    assert solved == [1]
+
+
+@pytest.mark.parametrize("asked", ["settle", "rest"])
+def test_ctrl_c_after_the_last_instant_of_a_pass_leaves_a_whole_take(run, monkeypatch, asked):
+    kind = {"settle": Assignments, "rest": SecondPass}[asked]
+    last = getattr(kind, asked)
+
+    def pressed(itself):
+        press()
+        return last(itself)
+
+    monkeypatch.setattr(kind, asked, pressed)
+    setup, instants = recorded_inputs(run)
+    report = solve_instants(setup, instants).report
+    assert report.instants == len(instants) and not report.interrupted

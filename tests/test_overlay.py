@@ -90,6 +90,16 @@ def test_ctrl_c_leaves_a_whole_video_and_the_earlier_one(scene, tmp_path):
     assert (tmp_path / "demo_cam1_overlay.mp4").read_bytes() == whole
 
 
+def test_ctrl_c_at_the_last_frame_leaves_what_is_drawn_and_begins_no_other(scene, tmp_path):
+    def stop(what: str, done: int, of: int) -> None:
+        if what == "drawing cam1" and done == of:
+            signal.raise_signal(signal.SIGINT)
+
+    made = drawn(scene, tmp_path, progress=stop)
+    assert made.interrupted
+    assert [path.name for path in made.files] == ["demo_cam1_overlay.mp4"]
+
+
 def test_overlay_command_finds_the_session_beside_the_take(scene, tmp_path):
     folder, simulation = scene
     result = CliRunner().invoke(

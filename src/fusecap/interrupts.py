@@ -20,8 +20,9 @@ class Interruption:
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
         """As a handler of SIGINT."""
+        if self.asked:
+            raise KeyboardInterrupt
         self.asked = True
-        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @contextmanager

@@ -165,18 +165,22 @@ class _Solved:
 
 def _draw(jobs: Iterable[_Job], progress: Progress | None) -> DrawnVideos:
     files: list[Path] = []
-    for job in jobs:
-        info = job.video.info
-        partial = job.path.with_name(f"{job.path.stem}_interrupted{job.path.suffix}")
-        with ctrl_c_held() as stop, overlay_writer(partial, info.size_px, info.rate_hz) as writer:
-            for frame in job.video.frames():
-                job.paint(frame)
-                writer.add(frame.image, frame.time_ns)
-                if progress is not None:
-                    progress(f"drawing {job.name}", frame.number + 1, info.frames)
-                if stop.asked:
-                    break
-        if stop.asked:
-            return DrawnVideos(files=[*files, partial], interrupted=True)
-        files.append(partial.replace(job.path))
+    with ctrl_c_held() as stop:
+        for job in jobs:
+            if stop.asked:
+                return DrawnVideos(files=files, interrupted=True)
+            info, whole = job.video.info, True
+            partial = job.path.with_name(f"{job.path.stem}_interrupted{job.path.suffix}")
+            with overlay_writer(partial, info.size_px, info.rate_hz) as writer:
+                for frame in job.video.frames():
+                    if stop.asked:
+                        whole = False
+                        break
+                    job.paint(frame)
+                    writer.add(frame.image, frame.time_ns)
+                    if progress is not None:
+                        progress(f"drawing {job.name}", frame.number + 1, info.frames)
+            if not whole:
+                return DrawnVideos(files=[*files, partial], interrupted=True)
+            files.append(partial.replace(job.path))
     return DrawnVideos(files=files, interrupted=False)

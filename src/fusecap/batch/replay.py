@@ -98,8 +98,12 @@ def solve_as_live(recording: Recording, progress: Progress | None = None) -> tup
     )
     solve_s: list[float] = []
     statuses, found_anew = Counter(), Counter()
+    interrupted = False
     with ctrl_c_held() as stop:
         for step in again.steps(progress):
+            if stop.asked:
+                interrupted = True
+                break
             people = [one for one in step.people.values() if one is not None]
             builder.add(step.timestamp_ns, people)
             for one in people:
@@ -108,8 +112,6 @@ def solve_as_live(recording: Recording, progress: Progress | None = None) -> tup
             for estimate in step.step.estimates:
                 solve_s.append(estimate.solve_s)
                 statuses[estimate.status.name.lower()] += 1
-            if stop.asked:
-                break
     solve_ms = np.array(solve_s or [np.nan]) * 1e3
     report = SolveReport(
         instants=len(builder),
@@ -122,7 +124,7 @@ def solve_as_live(recording: Recording, progress: Progress | None = None) -> tup
         solves=len(solve_s),
         statuses=dict(statuses),
         elapsed_s=time.perf_counter() - started,
-        interrupted=stop.asked,
+        interrupted=interrupted,
         notes=(*loss_notes(recording), again.note()),
     )
     return Solved(builder=builder, report=report), again

@@ -6,7 +6,7 @@ from the instant somebody was first seen rather than the one they were confirmed
 long that its poses are those of the whole take.
 
 Interrupted (Ctrl-C), either pass ends at the instant it had reached and the take holds what was
-solved.
+solved; what is sorted is solved all the same. A second Ctrl-C ends both at once.
 """
 
 from __future__ import annotations
@@ -167,35 +167,38 @@ def solve_instants(
         landmarks=len(setup.landmarks.landmark_names),
         pose_size=setup.skeleton.pose_size,
     )
-    tracked = sort_instants(setup, instants, assigned, progress)
     reprojection = Reprojection(setup.rig, setup.landmarks)
-    names = _in_order([model.name for model in setup.subjects], tracked.shapes)
-    subjects = SubjectSums(names)
-    builder = TakeBuilder(
-        skeleton=setup.skeleton,
-        rate_hz=setup.rate_hz,
-        subject_names=names,
-        provenance=provenance(
-            options={"solver": asdict(setup.options), "cameras": list(setup.rig.names)},
-            session_sha256=session_sha256,
-            simulated=simulated,
-        ),
-    )
     solve_s, statuses = array("d"), Counter()
-    what = "solving what is sorted" if tracked.interrupted else "solving"
-
-    def keep(finished: Iterator[Instant]) -> None:
-        for instant in finished:
-            people = instant.people.values()
-            builder.add(instant.timestamp_ns, [estimate for estimate, _ in people])
-            for estimate, observation in people:
-                subjects.add(estimate)
-                reprojection.add(estimate, observation.keypoints)
-
     with ctrl_c_held() as stop:
+        tracked = sort_instants(setup, instants, assigned, progress, stop)
+        interrupted = len(assigned) < len(instants)
+        names = _in_order([model.name for model in setup.subjects], tracked.shapes)
+        subjects = SubjectSums(names)
+        builder = TakeBuilder(
+            skeleton=setup.skeleton,
+            rate_hz=setup.rate_hz,
+            subject_names=names,
+            provenance=provenance(
+                options={"solver": asdict(setup.options), "cameras": list(setup.rig.names)},
+                session_sha256=session_sha256,
+                simulated=simulated,
+            ),
+        )
+
+        def keep(finished: Iterator[Instant]) -> None:
+            for instant in finished:
+                people = instant.people.values()
+                builder.add(instant.timestamp_ns, [estimate for estimate, _ in people])
+                for estimate, observation in people:
+                    subjects.add(estimate)
+                    reprojection.add(estimate, observation.keypoints)
+
         second = SecondPass(setup, tracked.shapes)
+        answered = stop.asked
+        what = "solving what is sorted" if answered else "solving"
         for instant in range(len(assigned)):
-            if stop.asked:
+            if stop.asked and not answered:
+                interrupted = True
                 break
             detections, readings = instants.detections(instant), instants.readings(instant)
             second.begin(tracked.begun.get(instant, ()))
@@ -206,7 +209,6 @@ def solve_instants(
             if progress:
                 progress(what, instant + 1, len(assigned))
         keep(second.rest())
-    interrupted = tracked.interrupted or stop.asked
     solve_ms = np.array(solve_s or [np.nan]) * 1e3
     return Solved(
         builder=builder,

@@ -14,7 +14,7 @@ import numpy as np
 from fusecap.associate.sensor_vote import FITS, SensorVote
 from fusecap.batch.assignments import Assignments
 from fusecap.body.shape import BodyShape
-from fusecap.interrupts import Interruption, ctrl_c_held
+from fusecap.interrupts import Interruption
 from fusecap.pipeline import Pipeline, Step, worn_sensors
 from fusecap.progress import Progress
 from fusecap.setup import Setup
@@ -54,25 +54,17 @@ class Sorted:
     """By instant, who must be found there anew: until then somebody else was followed."""
     found_anew: Mapping[str, int]
     """How often somebody's pose did not fit and was found anew."""
-    interrupted: bool
     notes: tuple[str, ...]
 
 
 def sort_instants(
-    setup: Setup, instants: Instants, assigned: Assignments, progress: Progress | None
-) -> Sorted:
-    """Fill `assigned`; Ctrl-C ends it at the instant it had reached."""
-    with ctrl_c_held() as stop:
-        return _sort(setup, instants, assigned, progress, stop)
-
-
-def _sort(
     setup: Setup,
     instants: Instants,
     assigned: Assignments,
     progress: Progress | None,
     stop: Interruption,
 ) -> Sorted:
+    """Fill `assigned`; Ctrl-C ends it at the instant it had reached."""
     window = min(setup.options.window, SEEDING_WINDOW)
     options = replace(setup.options, window=window, seeding=True)
     pipeline = Pipeline(replace(setup, options=options))
@@ -119,7 +111,6 @@ def _sort(
         shapes={name: pipeline.estimator(name).shape for name in assigned.names},
         begun=begun,
         found_anew={name: len(times_s) for name, times_s in found_anew.items()},
-        interrupted=stop.asked,
         notes=(*notes, *(_posed_anew(name, times_s) for name, times_s in found_anew.items())),
     )
 

@@ -63,5 +63,5 @@ def overlay(
     else:
         wrote(*drawn.files)
     if drawn.interrupted:
-        err.print("interrupted: the last video ends where it was stopped")
+        err.print("interrupted: what was drawn until then is kept")
         raise typer.Exit(130)
