@@ -394,6 +394,15 @@ def test_sensors_alone_drift_less_where_feet_stand():
     assert drift[1] < 0.5 * drift[0]
 
 
+def test_nobody_jumps_where_two_pieces_meet(rng):
+    truth = marched(300)
+    start = truth + 0.01 * rng.normal(size=truth.shape)
+    start[:, :3] += np.linspace(0.0, 0.5, 300)[:, None] ** 2
+    poses = moved_together(solver(0), start, observations(truth, cameras=0))
+    third_m = np.linalg.norm(np.diff(poses[:, :3], 3, axis=0), axis=1)
+    assert third_m.max() < 1e-3
+
+
 def test_poses_ahead_that_went_astray_do_not_keep_each_other_there(rng):
     truth = walk(14)
     seen = observations(truth, sites=ImuSites.none())

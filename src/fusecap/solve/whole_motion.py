@@ -2,7 +2,8 @@
 
 A window so long that its older part no longer changes: `PIECE` instants get their last pose
 together, with `AHEAD` after them known, and are folded. Cost grows with a take's length, memory
-does not.
+does not. Without cameras what comes later moves the root by centimetres even then: it goes over to
+its new place for as long as instants had been solved before.
 """
 
 from __future__ import annotations
@@ -43,6 +44,8 @@ class WholeMotion:
         """Motions that take turns may share a `workspace` for `PIECE + AHEAD` instants."""
         self._window = WindowSolver(solver, PIECE + AHEAD, workspace)
         self._turn_shares = turn_shares(solver.skeleton)
+        self._seam_m = np.zeros((0, 3))
+        """Where the root was at instants that were already solved when those before them left."""
         self._told = 0
         """Instants that were asked which feet stand; what came now tells of the last of them."""
 
@@ -73,7 +76,13 @@ class WholeMotion:
         for row, (turn, place) in enumerate(zip(*spreads, strict=True)):
             back = window.count - 1 - row
             bars = sigmas(turn, place, self._turn_shares, one_view=window.by_one_view(back))
-            settled.append(Settled(window.pose(back), bars))
+            theta = window.pose(back)
+            if row < len(self._seam_m):
+                new = (row + 1) / (len(self._seam_m) + 1)
+                theta[:3] += (1.0 - new * new * (3.0 - 2.0 * new)) * (self._seam_m[row] - theta[:3])
+            settled.append(Settled(theta, bars))
         window.fold(count)
+        left = range(window.count - 1, -1, -1)
+        self._seam_m = np.array([window.pose(back)[:3] for back in left]).reshape(-1, 3)
         self._told = window.count
         return settled
