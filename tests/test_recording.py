@@ -718,6 +718,47 @@ def test_times_beyond_any_clock_are_survived(whole, tmp_path):
     path = tmp_path / "late.mcap"
     packed = chunk_record(zstandard.compress(late), len(late), zlib.crc32(late))
     path.write_bytes(header_of(whole) + packed)
-    index = RecordingIndex(Recording(path))
-    (places,) = index.poses.values()
-    assert index.read(places, 0) is None
+    recording = Recording(path)
+    assert not RecordingIndex(recording).poses and recording.loss.malformed == 1
+
+
+def one_record(opcode: int, *content: bytes) -> bytes:
+    return struct.pack("<BQ", opcode, sum(map(len, content))) + b"".join(content)
+
+
+def texts(*values: str) -> bytes:
+    return b"".join(struct.pack("<I", len(value)) + value.encode() for value in values)
+
+
+SCHEMA = one_record(3, struct.pack("<H", 1), texts("fusecap.Pose", "jsonschema", "{}"))
+
+
+def channel(number: int) -> bytes:
+    about = texts("/pose/anna", "json"), struct.pack("<I", 0)
+    return one_record(4, struct.pack("<HH", number, 1), *about)
+
+
+def moment(number: int, at_ns: int) -> bytes:
+    return one_record(5, struct.pack("<HIQQ", number, 1, 0, UNIX_NS + at_ns), b"{}")
+
+
+def indexed(whole: Path, path: Path, *records: bytes) -> tuple[RecordingIndex, Recording]:
+    data = b"".join(records)
+    packed = chunk_record(zstandard.compress(data), len(data), zlib.crc32(data))
+    path.write_bytes(header_of(whole) + packed)
+    recording = Recording(path)
+    return RecordingIndex(recording), recording
+
+
+def test_two_channels_of_one_topic_are_one_in_their_order(whole, tmp_path):
+    records = [SCHEMA, channel(1), channel(2), *(moment(1 + n % 2, n) for n in range(6))]
+    index, _ = indexed(whole, tmp_path / "two.mcap", *records)
+    assert index.poses["anna"].times_ns.tolist() == [*range(6)]
+
+
+def test_a_broken_channel_loses_none_of_the_others_messages(whole, tmp_path):
+    broken = one_record(4, struct.pack("<HH", 2, 1), struct.pack("<I", 1 << 30))
+    records = SCHEMA, channel(1), broken, moment(1, 5), moment(1, 6)
+    index, recording = indexed(whole, tmp_path / "broken.mcap", *records)
+    assert index.poses["anna"].times_ns.tolist() == [5, 6]
+    assert recording.loss.malformed == 1 and not recording.loss.broken_chunks

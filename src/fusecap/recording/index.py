@@ -72,12 +72,21 @@ class RecordingIndex:
         names = [some.names.get(channel, ("", "")) for channel in channels.tolist()]
         is_event = np.array([schema in EVENTS for schema, _ in names], dtype=bool)
         numbers.take_all(some.sequence[is_event[which]])
+        topics: dict[tuple[str, str], list[int]] = {}
         for index in np.argsort(first).tolist():
-            schema, topic = names[index]
+            topics.setdefault(names[index], []).append(index)
+        ahead_ns = self._recording.unix_minus_session_ns
+        latest_ns = np.iinfo(np.int64).max + min(ahead_ns, 0)
+        possible = (some.publish_ns >= 0) & (some.publish_ns <= latest_ns)
+        for (schema, topic), indices in topics.items():
             if schema not in (POSE, BODY, KEYPOINTS):
                 continue
-            rows = np.flatnonzero(which == index)
-            times_ns = some.publish_ns[rows] - self._recording.unix_minus_session_ns
+            ours = np.isin(which, indices)
+            rows = np.flatnonzero(ours & possible)
+            self._recording.loss.malformed += int(ours.sum()) - len(rows)
+            if not len(rows):
+                continue
+            times_ns = some.publish_ns[rows] - ahead_ns
             if schema == POSE:
                 name = topic.removeprefix("/pose/")
                 self.poses.setdefault(name, Places(POSE)).add(some, rows, times_ns)

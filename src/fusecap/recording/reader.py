@@ -150,7 +150,7 @@ class Loss:
     """At the end, after the last whole record."""
     broken_chunks: int = 0
     malformed: int = 0
-    """Messages that do not follow the format."""
+    """Messages, or what tells of them, that do not follow the format."""
     missing_events: int = 0
     """By their numbers; those after the end cannot be known."""
 
@@ -226,7 +226,7 @@ class Recording:
                             f"{self.path}: unpacks to more than {most} bytes, {MAX_RATIO} times "
                             "its size; no run leaves such a recording"
                         )
-                    yield from _messages_in(record_at, data, said)
+                    yield from _messages_in(record_at, data, said, loss)
                 except (*_BROKEN, zstandard.ZstdError, MemoryError):
                     loss.broken_chunks += 1
         loss.note = said.note
@@ -381,14 +381,17 @@ class EventNumbers:
         return max(self._last, self._stated) - self._count
 
 
-def _messages_in(record_at: int, data: memoryview, said: _Said) -> Iterator[Messages]:
+def _messages_in(record_at: int, data: memoryview, said: _Said, loss: Loss) -> Iterator[Messages]:
     """Those of one record, after `said` has heard it; raises `ValueError` after what is whole."""
     content = np.frombuffer(data, np.uint8)
     none = np.empty((0, COLUMNS), np.int64)
     rows = np.zeros((find_records(content, Opcode.MESSAGE, _MESSAGE.size, none), COLUMNS), np.int64)
     find_records(content, Opcode.MESSAGE, _MESSAGE.size, rows)
     for opcode, start, end in rows[np.isin(rows[:, 0], _BETWEEN), :3].tolist():
-        said.hear(opcode, data[start:end])
+        try:
+            said.hear(opcode, data[start:end])
+        except _BROKEN:
+            loss.malformed += 1
     _, start, end, channel, sequence, log_ns, publish_ns = rows[rows[:, 0] == Opcode.MESSAGE].T
     yield Messages(
         names=said.channels,
