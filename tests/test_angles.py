@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 import fusecap
 from angle_signs import MORE_DEG, figures
 from export_people import two_walkers, with_gap
+from fusecap import feet
 from fusecap.angles.constants import CONSTANT_DEG
 from fusecap.angles.gait import gait_cycles
 from fusecap.angles.joint_angles import ANY_ANGLE_SD_DEG, joint_angles
@@ -355,6 +356,18 @@ def test_on_a_treadmill_both_feet_have_cycles():
 def test_a_floor_does_not_move_under_who_stands_walks_or_is_not_there():
     for take in (two_walkers(), posed({}), with_gap(on_a_treadmill(1.1), slice(0, 400))):
         assert not floor_velocity(take, 0).any()
+
+
+def test_feet_of_a_take_of_one_frame_a_second_are_told(monkeypatch):
+    monkeypatch.setattr(feet, "floor_velocity", lambda *_: np.array([0.0, 0.0, -1.1]))
+    rare = replace(on_a_treadmill(1.1), timestamps_ns=np.arange(400) * 10**9, rate_hz=1.0)
+    assert len(feet.on_floor(rare, 0, "left")) == 400
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_floor_does_not_move_under_who_is_there_for_single_frames():
+    gaps = [frame for frame in range(400) if frame % 3]
+    assert not floor_velocity(with_gap(on_a_treadmill(1.1), gaps), 0).any()
 
 
 def test_a_side_without_a_cycle_is_told_and_why(tmp_path):

@@ -64,7 +64,9 @@ def on_floor(take: Take, subject: int, side: str) -> Bool[np.ndarray, " t"]:
     ahead_m = np.where(tracked, ahead_m, np.nanmedian(ahead_m[tracked]))
     stride_m = np.ptp(np.percentile(ahead_m[tracked], (5, 95)))
     strikes, leaves = (
-        find_peaks(turned, prominence=_STRIDE * stride_m, distance=_STEP_S * take.rate_hz)[0]
+        find_peaks(
+            turned, prominence=_STRIDE * stride_m, distance=max(1.0, _STEP_S * take.rate_hz)
+        )[0]
         for turned in (ahead_m, -ahead_m)
     )
     down = np.zeros(len(tracked), dtype=bool)
@@ -82,9 +84,12 @@ def floor_velocity(take: Take, subject: int) -> Float[np.ndarray, "3"]:
     heights = np.stack([place[:, 1] for place, _ in moves])[:, tracked]
     velocities = np.stack([velocity for _, velocity in moves])[:, tracked]
     lower = velocities[heights.argmin(axis=0), np.arange(heights.shape[1])]
-    floor = np.nanmedian(lower, axis=0) * [1.0, 0.0, 1.0]
     _, hips = _moves(take, subject, take.bone_names[0])
-    gone = np.nanmedian(hips[tracked], axis=0) * [1.0, 0.0, 1.0]
+    known = np.isfinite(lower).all(axis=1) & np.isfinite(hips[tracked]).all(axis=1)
+    if not known.any():
+        return _STILL
+    floor = np.median(lower[known], axis=0) * [1.0, 0.0, 1.0]
+    gone = np.median(hips[tracked][known], axis=0) * [1.0, 0.0, 1.0]
     speed = np.linalg.norm(floor)
     stays = np.linalg.norm(gone) < _STAYS * speed
     return floor if speed > _SLOW_M_S and stays else _STILL

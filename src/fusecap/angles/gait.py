@@ -33,8 +33,8 @@ class GaitCycles:
         """Of a side without a cycle."""
         if not self.strikes:
             return (
-                "it is nowhere low and slow after a step; is the floor at y = 0, and are feet seen "
-                "or worn?"
+                "it is nowhere low and slow after a step and walks on no belt; is the floor at "
+                "y = 0, and are feet seen or worn?"
             )
         if self.strikes == 1:
             return "it comes down once"
