@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -150,6 +151,26 @@ def test_a_session_that_was_changed_is_not_taken_for_the_one_solved(scene, tmp_p
     assert found is None and "not as it was solved" in why
     result = run(tmp_path / "demo.npz", "--session", tmp_path, "--json")
     assert "no longer" in json.loads(result.stdout)["notes"][0]
+
+
+def test_view_shows_cameras_of_the_session_a_take_was_solved_from_alone(
+    scene, tmp_path, monkeypatch
+):
+    shown = []
+    module = sys.modules["fusecap.cli.view"]
+
+    def look(take, *_, rig, **__):
+        take.close()
+        shown.append(rig is not None)
+
+    monkeypatch.setattr(module, "look", look)
+    shutil.copytree(scene, tmp_path, dirs_exist_ok=True)
+    assert CliRunner().invoke(app, ["view", str(tmp_path / "demo.npz")]).exit_code == 0
+    with (tmp_path / "session.toml").open("a") as file:
+        file.write("# changed\n")
+    result = CliRunner().invoke(app, ["view", str(tmp_path / "demo.npz")])
+    assert "not as it was solved" in " ".join(result.stderr.split())
+    assert shown == [True, False]
 
 
 def test_names_are_text_and_nothing_else():

@@ -18,6 +18,7 @@ from fusecap.sources.session import FILE_NAME
 from fusecap.sources.session_cameras import with_detections
 from fusecap.sources.session_data import content_hash, open_session
 from fusecap.sources.session_file import load_session
+from fusecap.stored_take import StoredTake
 from fusecap.take import Take
 
 
@@ -32,7 +33,7 @@ class SolvedInputs:
     """What is odd about a session; of a recording nothing is checked."""
 
 
-def inputs_beside(path: Path, take: Take) -> tuple[Path | None, str]:
+def inputs_beside(path: Path, take: Take | StoredTake) -> tuple[Path | None, str]:
     """The session or recording in a take's folder that it was solved from, or why there is none."""
     expected = take.provenance.get("session_sha256")
     if not expected:

@@ -81,11 +81,22 @@ def view(
         rig, filmed = _filmed(session)
     elif detections is not None:
         rig = detections.setup.rig
-    elif take.with_name(FILE_NAME).is_file():
-        try:
-            rig, filmed = _filmed(take.with_name(FILE_NAME))
-        except FusecapError as error:
-            note(f"without the cameras of the session beside the take: {error}")
+    elif isinstance(loaded, StoredTake) and take.with_name(FILE_NAME).is_file():
+        from fusecap.batch.solved_inputs import inputs_beside
+
+        beside, why = inputs_beside(take, loaded)
+        if beside is None:
+            note(f"without the cameras of the session beside the take: {why}")
+        elif beside.name == FILE_NAME:
+            try:
+                rig, filmed = _filmed(beside)
+            except FusecapError as error:
+                note(f"without the cameras of the session beside the take: {error}")
+        else:
+            note(
+                f"without cameras: the take is of {beside.name}, whose clock is not that of the "
+                f"session's videos; to see cameras: fusecap view {beside.name}"
+            )
     curves = [] if truth is None else error_curves(loaded, StoredTake(truth))
     look(
         loaded,
