@@ -7,8 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fusecap.associate.anatomy import Anatomy
+from fusecap.associate.options import TrackerOptions
 from fusecap.associate.sensor_vote import FITS, SensorVote
-from fusecap.associate.track import Track
+from fusecap.associate.subjects import Cast, Subject
+from fusecap.associate.track import SURELY_APART, Track
 from fusecap.batch.solve import solve_instants
 from fusecap.body.landmarks import landmark_set_named
 from fusecap.evaluate.imu_noise import IMUS_6
@@ -167,3 +170,76 @@ def test_too_few_sensors_have_no_vote():
     vote = SensorVote(landmark_set_named("body25"), {"anna": ("hips", "left_hand", "head")})
     vote.hear([], np.zeros((0, 25, 3)), {}, 0.0)
     assert not vote.heard
+
+
+class ToldVote(SensorVote):
+    """What sensors say, by track and wearer."""
+
+    def __init__(self, told):
+        super().__init__(landmark_set_named("body25"), {})
+        self.told = told
+        self.heard = frozenset(name for _, name in told)
+
+    def misfit(self, track, name, least_s):
+        return self.told.get((track.track_id, name), np.nan)
+
+
+def cast_of(simulation, *names, **options):
+    landmark_set = simulation.landmark_set
+    subjects = [Subject(name=name) for name in names]
+    return Cast(subjects, simulation.rig, Anatomy(landmark_set), TrackerOptions(**options))
+
+
+def standing_at(simulation, number, x_m, born_s, seen_s):
+    landmarks = np.tile([x_m, 1.0, 0.0], (25, 1))
+    anatomy = Anatomy(simulation.landmark_set)
+    lengths = np.full(anatomy.limb_count, 0.4)
+    track = Track(number, landmarks, landmarks[0], lengths, round(born_s * 1e9))
+    track.frames = track.strong_frames = 100
+    track.seen_ns = track.triangulated_ns = track.time_ns = round(seen_s * 1e9)
+    return track
+
+
+@pytest.mark.parametrize("apart", [True, False])
+def test_who_walked_beside_a_wearer_does_not_become_the_wearer_who_leaves(simulation, apart):
+    cast = cast_of(simulation, "x", max_subjects=1)
+    wearer = standing_at(simulation, 1, 0.0, 0.0, 0.0)
+    other = standing_at(simulation, 2, 2.0, 0.0, 0.0)
+    cast.admit([wearer], 0, ToldVote({(1, "x"): 0.05}))
+    assert cast.ids() == {1}
+    if apart:
+        wearer.beside[other] = other.beside[wearer] = SURELY_APART
+    minute_ns, now_ns = 60 * 10**9, 61 * 10**9
+    wearer.seen_ns = wearer.triangulated_ns = minute_ns
+    other.seen_ns = other.triangulated_ns = now_ns
+    cast.forget([other], now_ns)
+    cast.admit([other], now_ns, ToldVote({(2, "x"): 0.05}))
+    assert cast.returned == ({} if apart else {2: (1, minute_ns)})
+
+
+def test_whom_sensors_did_not_fit_is_no_evidence_against_who_wears_them(simulation):
+    cast = cast_of(simulation, "x", max_subjects=1)
+    mistaken = standing_at(simulation, 1, 0.0, 0.0, 0.0)
+    wearer = standing_at(simulation, 2, 2.0, 0.0, 1.0)
+    cast.admit([mistaken], 0, ToldVote({(1, "x"): 0.05}))
+    cast.contradicted(ToldVote({(1, "x"): 0.9}), 0)
+    mistaken.beside[wearer] = wearer.beside[mistaken] = SURELY_APART
+    cast.forget([wearer], 10**9)
+    cast.admit([wearer], 10**9, ToldVote({(2, "x"): 0.05}))
+    assert cast.returned == {2: (1, 0)}
+
+
+@pytest.mark.parametrize(("misfit", "admitted_as"), [(0.9, "y"), (np.nan, None), (0.05, "x")])
+def test_a_missing_wearer_holds_back_those_who_may_be_it_and_nobody_else(
+    simulation, misfit, admitted_as
+):
+    cast = cast_of(simulation, "x", "y", max_subjects=2)
+    wearer = standing_at(simulation, 1, 0.0, 0.0, 0.0)
+    cast.admit([wearer], 0, ToldVote({(1, "x"): 0.05}))
+    now_ns = 10 * 10**9
+    newcomer = standing_at(simulation, 3, 0.1, 9.5, 10.0)
+    beside = standing_at(simulation, 4, 3.0, 9.9, 9.9)
+    cast.forget([newcomer, beside], now_ns)
+    cast.admit([newcomer, beside], now_ns, ToldVote({(3, "x"): misfit}))
+    followed = dict(cast.followed())
+    assert followed == ({admitted_as: newcomer} if admitted_as else {})

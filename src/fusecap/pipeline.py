@@ -81,7 +81,7 @@ class Step:
     """When these went astray; None where sensors' readings must tell."""
     returned: Mapping[int, tuple[int, int]] = field(default_factory=dict)
     """Of newcomers who turned out to be subjects that nobody saw: by the track id they had, the
-    subject's, and when they were first seen [ns]."""
+    subject's, and since when [ns]."""
     found_anew: Mapping[str, int] = field(default_factory=dict)
     """By name, whose pose did not fit and was found anew, and since when [ns] it was wrong."""
     bystanders: tuple[TrackUpdate, ...] = ()

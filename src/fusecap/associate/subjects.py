@@ -76,7 +76,7 @@ class Cast:
         self.undecided: list[Track] = []
         """Who may soon turn out to be a missing subject, or to stand beside who begins there."""
         self.returned: dict[int, tuple[int, int]] = {}
-        """At this instant, by the id a newcomer had, whose it has, and when it was born [ns]."""
+        """At this instant, by the id a newcomer had, whose it has, and since when [ns]."""
         self._single = len(rig) == 1
         self.size = options.max_subjects or len(subjects) or sys.maxsize
         """Subjects there may be at most."""
@@ -268,7 +268,10 @@ class Cast:
         newcomers = [t for t in tracks if t.track_id not in subjects and self._may_enter(t, now_ns)]
         self.kept_out, self.undecided, self.returned = [], [], {}
         gone = [p for p in self._places if p.name in vote.heard and self._is_away(p, now_ns)]
-        newcomers, _ = self._admit_wearers(newcomers, gone, tracks, now_ns, vote)
+        newcomers, _, early = self._admit_wearers(newcomers, gone, tracks, now_ns, vote)
+        if early:
+            others = [t for t in early if all(self._away(t, p, vote) >= FITS for p in gone)]
+            newcomers = [t for t in newcomers if t not in early or t in others]
         known = [p for p in self._places if p.track or p.start_m]
         away = self._by_clothes(newcomers, known, now_ns, vote)
         self.undecided = [
@@ -285,6 +288,7 @@ class Cast:
             ]
         )
         cost = np.where(by_looks(away), cost.reshape(len(newcomers), len(known)), np.inf)
+        cost[np.ix_([t in early for t in newcomers], [p in gone for p in known])] = np.inf
         open_s = [o.doubt_s if p.live else 0.0 for p in known]
         silent_s = [(now_ns - p.track.triangulated_ns) * 1e-9 if p.track else 0.0 for p in known]
         undecided = np.tile(np.array(silent_s) < np.array(open_s), (len(newcomers), 1))
@@ -303,7 +307,8 @@ class Cast:
         rest = [t for n, t in enumerate(newcomers) if n not in dict(admitted)]
         rest.sort(key=lambda t: (-t.frames, self._from_middle(t)))
         waiting = [p for p in self._places if not (p.live or p.track or p.start_m)]
-        rest, waiting = self._admit_wearers(rest, waiting, tracks, now_ns, vote)
+        rest, waiting, early = self._admit_wearers(rest, waiting, tracks, now_ns, vote)
+        rest = [track for track in rest if track not in early]
         chosen = rest[: len(waiting) + max(self._room(), 0)]
         if any(p.track and not p.live for p in self._places):
             self.kept_out = [track for track in rest if track not in chosen]
@@ -320,16 +325,16 @@ class Cast:
         tracks: Sequence[Track],
         now_ns: int,
         vote: SensorVote,
-    ) -> tuple[list[Track], list[Place]]:
+    ) -> tuple[list[Track], list[Place], list[Track]]:
         """Places of whoever wears sensors go to whom they fit; who else may be admitted, and where.
 
-        Where there are several a newcomer of whom sensors do not tell yet waits a while, then is
-        admitted like others: who was mistaken is paired anew later.
+        The last are those who are too early for a wearer's place: where there are several, others
+        wait a while, then are admitted like everybody; who was mistaken is paired anew later.
         """
         worn = [p for p in waiting if p.name in vote.heard]
         if not worn or not newcomers:
-            return newcomers, waiting
-        cost = np.array([[vote.misfit(t, p.name, SOON_S) for p in worn] for t in newcomers])
+            return newcomers, waiting, []
+        cost = np.array([[self._away(t, p, vote) for p in worn] for t in newcomers])
         named = set()
         for n, w in cheapest(np.where(cost < FITS, cost, np.inf)):
             others = np.concatenate([np.delete(cost[n], w), np.delete(cost[:, w], n)])
@@ -338,13 +343,20 @@ class Cast:
                 named.add(n)
         waiting = [p for p in waiting if not p.live]
         undisputed = len(tracks) == len(worn) == 1 or all(p.live for p in worn)
-        left = [
-            t
-            for n, t in enumerate(newcomers)
-            if n not in named
-            and (undisputed or (now_ns - t.born_ns) * 1e-9 >= self._options.patience_s)
-        ]
-        return left, waiting
+        left = [t for n, t in enumerate(newcomers) if n not in named]
+        wait_ns = 0.0 if undisputed else self._options.patience_s * 1e9
+        return left, waiting, [t for t in left if now_ns - t.born_ns < wait_ns]
+
+    @staticmethod
+    def _away(track: Track, place: Place, vote: SensorVote) -> float:
+        """How badly a newcomer fits a wearer's sensors; infinite: is known to be somebody else.
+
+        Whom the sensors did not fit either, who was followed there, is no evidence.
+        """
+        was = place.track if place.misfit_since_ns is None else None
+        if was is not None and track.is_other_than(was):
+            return np.inf
+        return vote.misfit(track, place.name, SOON_S)
 
     def _by_clothes(
         self, newcomers: Sequence[Track], places: Sequence[Place], now_ns: int, vote: SensorVote
@@ -421,7 +433,9 @@ class Cast:
     def _admit_to(self, place: Place, track: Track, everyone: Sequence[Track]) -> None:
         """A place that was live is handed over: nobody follows there whom it had any more."""
         if place.track is not None:
-            self.returned[track.track_id] = (place.track.track_id, track.born_ns)
+            # Until it was last measured there, it was somebody else's way that the newcomer went.
+            since_ns = max(track.born_ns, place.track.triangulated_ns)
+            self.returned[track.track_id] = (place.track.track_id, since_ns)
             if place.live:
                 place.track.replaced = True
             track.becomes(place.track, everyone)
