@@ -32,6 +32,7 @@ from fusecap.live.devices.source import SessionClock
 from fusecap.live.recorder import Recorder
 from fusecap.recording import reader
 from fusecap.recording.index import RecordingIndex
+from fusecap.recording.layout import DECODERS, POSE, Known, pose_message
 from fusecap.recording.reader import RecordedEvent, RecordedPose, Recording
 from fusecap.recording.setup_json import setup_from_values, setup_values
 from fusecap.recording.writer import RecordingWriter
@@ -169,6 +170,16 @@ def test_poses_read_back_to_the_same_bits(run, whole):
         assert pose.theta.tobytes() == estimate.theta.tobytes()
         assert pose.bone_sigma_deg.tobytes() == estimate.bone_sigma_deg.tobytes()
         assert pose.position_sigma_m.tobytes() == estimate.position_sigma_m.tobytes()
+
+
+def test_poses_from_before_there_was_a_mark_count_as_measured():
+    known = Known.of(setup_values(small_setup()))
+    values = json.loads(pose_message(estimate_of(7)))
+    assert not any(values["views"]), "sensors alone may have told"
+    assert DECODERS[POSE](values, known)["measured"] is True
+    assert DECODERS[POSE](values | {"measured": False}, known)["measured"] is False
+    del values["measured"]
+    assert DECODERS[POSE](values, known)["measured"] is True
 
 
 # As others read it
