@@ -6,10 +6,12 @@ import pytest
 from fusecap.body.prior import load_prior
 from fusecap.body.skeleton import PAPER21
 from fusecap.evaluate.demo_scene import demo_scene
+from fusecap.evaluate.simulated_solve import setup_of_simulation
 from fusecap.geometry.triangulation import triangulate
+from fusecap.pipeline import make_estimator
 from fusecap.solve.estimator import Estimator, SubjectModel
 from fusecap.solve.options import SolverOptions
-from fusecap.types import Observation
+from fusecap.types import ImuReading, Observation
 
 LATER_NS = 10**12
 
@@ -82,3 +84,19 @@ def test_poses_that_few_cameras_see_are_not_found_alone_for_a_take(simulation, c
             for one in (first_pass, instants)
         )
     assert np.array_equal(ours.theta, theirs.theta) == alone
+
+
+@pytest.mark.parametrize("tells", [True, False])
+def test_a_reading_in_which_no_sensor_told_measures_nothing(simulation, tells):
+    setup = setup_of_simulation(simulation, options=SolverOptions(ahead=4))
+    known = make_estimator(setup, setup.subjects[0])
+    sensors = len(known.model.sites.bone)
+    assert sensors
+    for instant in range(6):
+        follow(known, simulation, instant, LATER_NS + instant * 16_666_667)
+    turns = np.tile(np.eye(3) if tells else np.full((3, 3), np.nan), (sensors, 1, 1))
+    unseen = np.zeros((len(simulation.rig), 25, 3))
+    silent = ImuReading(bone_rotation_in_world=turns, accel_in_world_m_s2=np.zeros((sensors, 3)))
+    later = Observation(timestamp_ns=LATER_NS + 10**8, keypoints=unseen, imu=silent)
+    assert known.ahead(later).measured == tells
+    assert known.update(later).measured == tells

@@ -190,3 +190,8 @@ def checked_moment(timestamp_ns: Any, last_ns: int | None) -> int:
             "forwards, each with a time of its own"
         )
     return int(timestamp_ns)
+
+
+def tells(reading: ImuReading | None) -> bool:
+    """Whether any sensor measured how its bone is turned."""
+    return reading is not None and bool(np.isfinite(reading.bone_rotation_in_world[:, 0, 0]).any())

@@ -10,8 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fusecap.batch.assignments import Assigned, Seed, seed_of
-from fusecap.batch.sorting import tells
-from fusecap.believable import believable_detections, believable_reading
+from fusecap.believable import believable_detections, believable_reading, tells
 from fusecap.body.shape import BodyShape
 from fusecap.pipeline import make_estimator, observation_of
 from fusecap.setup import Setup

@@ -13,6 +13,7 @@ import numpy as np
 
 from fusecap.associate.sensor_vote import FITS, SensorVote
 from fusecap.batch.assignments import Assignments
+from fusecap.believable import tells
 from fusecap.body.shape import BodyShape
 from fusecap.interrupts import Interruption
 from fusecap.pipeline import Pipeline, Step, worn_sensors
@@ -172,8 +173,3 @@ def _drop_tails(assigned: Assignments, instants: Instants) -> None:
         going_on &= set(here)
         going_on |= {name for name, seen in here.items() if seen or tells(readings.get(name))}
         assigned.keep(instant, going_on)
-
-
-def tells(reading: ImuReading | None) -> bool:
-    """Whether any sensor measured."""
-    return reading is not None and bool(np.isfinite(reading.bone_rotation_in_world).any())

@@ -24,6 +24,7 @@ from fusecap.believable import (
     believable_reading,
     checked_moment,
     shaped_numbers,
+    tells,
 )
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.body.pose import landmarks_in_world
@@ -211,7 +212,7 @@ class Estimator:
         self._learn_shape(landmarks_in_world_m)
         data = self._measurements(observation)
         views = np.asarray(np.any(observation.keypoints[:, :, 2] > 0, axis=1))
-        has_imu = bool(np.isfinite(data.imu_rotation[:, 0, 0]).any())
+        has_imu = tells(observation.imu)
         started = time.perf_counter()
         self.found_anew_since_ns = None
         if self._solution is None:
@@ -316,7 +317,7 @@ class Estimator:
                 self._solution,
                 self._views,
                 time.perf_counter() - started,
-                measured=observation.imu is not None,
+                measured=tells(observation.imu),
             ),
             theta=theta,
             bone_position_in_world_m=position,
