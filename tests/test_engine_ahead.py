@@ -7,6 +7,7 @@ import pytest
 
 from fusecap.engine.engine import Engine
 from fusecap.errors import InputError, SessionError
+from fusecap.pipeline import Step
 from fusecap.types import CameraSample, ImuReading, Observation, Tick
 from live_events import same_bits, steps_of
 from live_scene import Phase, capture, fastest, samples_of, score, simulated_setup, ticks_of
@@ -166,3 +167,25 @@ def test_instants_alone_can_only_be_sent_solved(simulation, tmp_path, poses):
     setup = setup_with(simulation, tmp_path, f'poses = "{poses}"\n[estimator]\nwindow = 1')
     with pytest.raises(SessionError, match="solved together"):
         Engine(setup)
+
+
+class PipelineOfNobody:
+    """Replaces a pose at every instant that is solved."""
+
+    def step(self, detections, readings):
+        return Step(updates=(), estimates=(), found_anew={"anna": detections.timestamp_ns})
+
+    def ahead(self, now_ns, readings):
+        return []
+
+
+def test_every_pose_that_is_found_anew_is_told_once(simulation, tmp_path):
+    engine = Engine(setup_with(simulation, tmp_path, 'poses = "ahead"'))
+    engine._pipeline = PipelineOfNobody()
+    times = [(1, False), (2, False), (3, True), (4, True), (3, False), (5, True)]
+    events = [Tick(timestamp_ns=10**8 * instant, ahead=ahead) for instant, ahead in times]
+    assert [dict(step.found_anew) for step in steps_of(engine, events)] == [
+        {"anna": 2},
+        {},
+        {"anna": 1},
+    ]

@@ -632,3 +632,24 @@ def test_a_meter_counts_whole_seconds():
     assert meter.rate_hz(5 * second) == pytest.approx(60, abs=0.5)
     assert meter.rate_hz(30 * second) == 0.0
     assert meter.total == 300
+
+
+def test_poses_that_are_held_are_sent_and_not_measured_and_every_replaced_one_counts():
+    class Holding(FakeEngine):
+        def take(self, event):
+            step = super().take(event)
+            if step is None:
+                return None
+            held = {name: replace(one, measured=False) for name, one in step.people.items()}
+            # Several steps may show one solve.
+            shown = replace(step.step, found_anew={"anna": 0})
+            once = {"anna": 2} if len(self.ticks) == 1 else {}
+            return replace(step, people=held, step=shown, found_anew=once)
+
+    engine = Holding()
+    with Going(make_run(engine=engine)) as going:
+        wait_for(lambda: len(engine.ticks) > 5)
+    assert going.report is not None
+    told = going.report.subjects["anna"]
+    assert told.tracked_share > 0.9
+    assert told.measured_share == 0.0 and told.found_anew == 2

@@ -108,7 +108,7 @@ def solve_as_live(recording: Recording, progress: Progress | None = None) -> tup
             builder.add(step.timestamp_ns, people)
             for one in people:
                 subjects.add(one)
-            found_anew.update(step.step.found_anew.keys())
+            found_anew.update(step.found_anew)
             for estimate in step.step.estimates:
                 solve_s.append(estimate.solve_s)
                 statuses[estimate.status.name.lower()] += 1

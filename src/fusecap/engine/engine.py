@@ -13,9 +13,9 @@ settled, or of a later one, for which ticks `ahead` ask.
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -61,6 +61,8 @@ class LiveStep:
     people: Mapping[str, Estimate | None]
     """Every subject in a lasting order, without jumps and with error bars that grow where nothing
     measures; None while there is no pose to send."""
+    found_anew: Mapping[str, int] = field(default_factory=dict)
+    """By name, how many poses were replaced since the step before this one."""
 
 
 class Engine:
@@ -96,6 +98,8 @@ class Engine:
         self._seen: set[str] = set()
         self._detections = self._cameras.detections(0)
         self._step = Step(updates=(), estimates=())
+        self._found_anew: Counter[str] = Counter()
+        """Since poses were last sent."""
         self._last_ns: int | None = None
         self._sent_ns: int | None = None
 
@@ -138,6 +142,7 @@ class Engine:
         self._detections = self._cameras.detections(now_ns)
         self._step = self._pipeline.step(self._detections, readings)
         self.notes.extend(self._step.notes)
+        self._found_anew.update(self._step.found_anew.keys())
         for name in self._step.found_anew:
             self.notes.append(f"{name}: the pose did not fit what was seen, and was found anew")
         if self._live.poses == "ahead":
@@ -166,6 +171,7 @@ class Engine:
         if self._sent_ns is not None and now_ns <= self._sent_ns:
             return None
         self._sent_ns = now_ns
+        found_anew, self._found_anew = self._found_anew, Counter()
         solved = {estimate.name: estimate for estimate in estimates}
         for name in solved:
             if name not in self._people:
@@ -184,6 +190,7 @@ class Engine:
             readings=readings,
             step=self._step,
             people=people,
+            found_anew=found_anew,
         )
 
     def _watch(self, name: str, measured: bool, silent_s: float) -> None:

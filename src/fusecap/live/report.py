@@ -26,7 +26,7 @@ class SubjectReport:
     tracked_share: float
     """Of instants: with a pose to send."""
     measured_share: float
-    """Of instants: with a pose that was solved, not held."""
+    """Of instants: with a pose that something measured."""
     bone_sigma_deg: float
     """Expected error of bones' rotations: mean over instants with a pose of the median bone."""
     position_sigma_m: float

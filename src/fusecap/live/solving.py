@@ -74,7 +74,7 @@ class PersonTally:
     instants: int = 0
     """With a pose to send."""
     measured: int = 0
-    """With a pose that was solved, not held."""
+    """With a pose that something measured."""
     bone_sigma_deg: float = 0.0
     """Sum over instants of the median over bones; so is the next."""
     position_sigma_m: float = 0.0
@@ -246,19 +246,18 @@ class Solving:
         cameras = len(step.detections.people)
         looked = step.detections.looked or (True,) * cameras
         looking = {camera for camera in range(cameras) if looked[camera]}
-        solved = step.detections.timestamp_ns != self._detections_ns
-        if solved:
+        if step.detections.timestamp_ns != self._detections_ns:
             self._detections_ns = step.detections.timestamp_ns
             self.looked += bool(looking)
             self.complete += bool(looking) and looking <= self._both_sides
-        measured = {estimate.name for estimate in step.step.estimates}
-        found_anew = step.step.found_anew if solved else {}
         for name, estimate in step.people.items():
-            if estimate is None or (name not in self.people and len(self.people) >= _PEOPLE):
+            if name not in self.people and (estimate is None or len(self.people) >= _PEOPLE):
                 continue
             tally = self.people.setdefault(name, PersonTally())
+            tally.found_anew += step.found_anew.get(name, 0)
+            if estimate is None:
+                continue
             tally.instants += 1
-            tally.measured += name in measured
-            tally.found_anew += name in found_anew
+            tally.measured += estimate.measured
             tally.bone_sigma_deg += float(np.median(estimate.bone_sigma_deg))
             tally.position_sigma_m += float(np.median(estimate.position_sigma_m))
