@@ -331,7 +331,7 @@ def test_nothing_else_opens_files_from_outside():
         "live/recorder.py",  # writes
         "exports/overlay.py",  # writes
         "exports/library.py",  # what a library has just written
-        "exports/formats/fbx.py",  # what Blender has just written
+        "exports/fbx_motion.py",  # what Blender has just written
         "take.py",  # writes
         "exports/formats/html.py",  # shipped
         "streams/stream.py",  # opens a protocol

@@ -175,6 +175,7 @@ def test_take_without_anyone_finds_nothing(truth):
                 "bone_position_in_world_m",
                 "bone_rotation_in_world_wxyz",
                 "tracked",
+                "measured",
                 "bone_sigma_deg",
                 "position_sigma_m",
             )

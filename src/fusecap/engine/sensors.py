@@ -66,10 +66,12 @@ class Sensors:
     def take(self, sample: ImuSample) -> None:
         """Keep a sample; one of no sensor or without an orientation is left out."""
         row = self._row.get((sample.subject, sample.bone))
-        norm = float(np.sqrt(np.dot(sample.orientation_wxyz, sample.orientation_wxyz)))
+        # A recording holds more digits than single precision: both must be computed alike.
+        orientation = np.asarray(sample.orientation_wxyz, dtype=np.float64)
+        accel = np.asarray(sample.accel_m_s2, dtype=np.float64)
+        norm = float(np.sqrt(np.dot(orientation, orientation)))
         if row is None or not 0.1 < norm < 10.0:
             return
-        orientation, accel = sample.orientation_wxyz, sample.accel_m_s2
         if abs(norm - 1.0) > 1e-9:
             orientation = orientation / norm
         if not np.isfinite(accel).all():
