@@ -36,6 +36,8 @@ from fusecap.body.skeleton import EXTENDED23, PAPER21
 from fusecap.cli import app
 from fusecap.errors import InputError, TakeError
 from fusecap.evaluate.demo_scene import demo_scene
+from fusecap.exports import fbx_motion
+from fusecap.exports.fbx_motion import NodeMotion
 from fusecap.exports.fbx_tree import FbxElement, FbxFile, array_property, text_property
 from fusecap.exports.formats import FORMATS, format_named
 from fusecap.exports.gltf import Gltf
@@ -697,6 +699,43 @@ def test_fbx_is_read_as_it_was_written():
         FbxFile.read(data[:23] + struct.pack("<I", 7700) + data[27:])
     with pytest.raises(InputError, match="unknown type b'Q'"):
         FbxFile.read(data.replace(b"L\x07\0", b"Q\x07\0"))
+
+
+@pytest.mark.parametrize("axes", ["XYZ", "XY", ""])
+def test_a_bone_of_an_fbx_moves_only_where_it_has_all_curves(axes):
+    def whole(number):
+        return b"L" + struct.pack("<q", number)
+
+    def connected(child, parent, to=b""):
+        kind = text_property(b"OP" if to else b"OO")
+        named = [text_property(to)] if to else []
+        return FbxElement(b"C", [kind, whole(child), whole(parent), *named])
+
+    bone = FbxElement(
+        b"Model",
+        [whole(1), text_property(b"hips\0\1Model"), text_property(b"LimbNode")],
+        [FbxElement(b"Properties70", [])],
+    )
+    kept = ("KeyTime", np.int64), ("KeyValueFloat", np.float32), ("KeyAttrRefCount", np.int32)
+    curves = [
+        FbxElement(
+            b"AnimationCurve",
+            [whole(10 + row)],
+            [FbxElement(k.encode(), [array_property(np.zeros(1, dtype=t))]) for k, t in kept],
+        )
+        for row in range(len(axes))
+    ]
+    node = FbxElement(b"AnimationCurveNode", [whole(2)])
+    lines = [connected(1, 0), connected(2, 1, b"Lcl Rotation")]
+    lines += [connected(10 + row, 2, f"d|{axis}".encode()) for row, axis in enumerate(axes)]
+    file = FbxFile(
+        7400,
+        [FbxElement(b"Objects", [], [bone, node, *curves]), FbxElement(b"Connections", [], lines)],
+        b"f" * 16,
+    )
+    moves = {"hips": NodeMotion(rest=np.eye(3), turn=Rotation.random(2, random_state=1))}
+    moved = fbx_motion._Scene(file, np.array([0.0, 0.1])).move(moves)
+    assert moved == ({"hips"} if axes == "XYZ" else set())
 
 
 def test_who_is_not_tracked_is_not_seen_in_glb_and_usd(tmp_path):

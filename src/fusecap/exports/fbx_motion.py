@@ -59,7 +59,7 @@ def write_fbx(
 ) -> None:
     """Writes a document, that stands at rest, with these nodes in motion; whole or not at all.
 
-    Raises `InputError` without Blender, or where it makes something else of a node than a bone.
+    Raises `InputError` without Blender, or where it leaves a node out, or one without curves.
     """
     names = _labelled(still.tree)
     with tempfile.TemporaryDirectory() as folder:
@@ -119,7 +119,7 @@ class _Scene:
         self._first_and_last = array_property(np.unique(ticks[[0, -1]]))
 
     def move(self, moves: Mapping[str, NodeMotion]) -> set[str]:
-        """Models whose names are keys get these motions; the names that were there."""
+        """Models whose names are keys get these motions; the names of those that do."""
         nothing = np.zeros((self._frames, 3))
         still = Rotation.identity(self._frames)
         world = _Placed(place_cm=nothing, turn=still, rest=Rotation.identity(), scale=1.0)
@@ -134,7 +134,7 @@ class _Scene:
             if model.name != b"Model":
                 continue
             move = moves.get(_name(model))
-            if move is not None:
+            if move is not None and self._has_curves(model, move):
                 found.add(_name(model))
             found |= self._move_below(child, self._placed(model, above, move), moves)
         return found
@@ -158,11 +158,15 @@ class _Scene:
                 self._set_curves(model, b"Lcl Translation", inside)
         return _Placed(place_cm=place_cm, turn=turn, rest=rest, scale=scale)
 
+    def _has_curves(self, model: FbxElement, move: NodeMotion) -> bool:
+        moved = [b"Lcl Rotation"] + [b"Lcl Translation"] * (move.place_m is not None)
+        return all({axis for axis, _ in self._curves(model, what)} == {0, 1, 2} for what in moved)
+
     def _curves(self, model: FbxElement, what: bytes) -> Iterator[tuple[int, FbxElement]]:
         """Of one of a model's properties, with its axis."""
         for node, to in self._below.get(model.whole(0), ()):
             if to == what:
-                for identity, component in self._below[node]:
+                for identity, component in self._below.get(node, ()):
                     yield b"XYZ".index(component[-1:]), self._objects[identity]
 
     def _at_rest(self, model: FbxElement, what: bytes, usual: float) -> Float[np.ndarray, "3"]:
