@@ -20,7 +20,7 @@ from fusecap.angles.joints import JOINTS
 from fusecap.body.skeleton import EXTENDED23, PAPER21
 from fusecap.cli import app
 from fusecap.errors import InputError, TakeError
-from fusecap.feet import floor_velocity
+from fusecap.feet import floor_velocity, foot_events
 from fusecap.take import save_take
 from motions import any_poses, person, take_of
 
@@ -273,6 +273,18 @@ def test_gait_cycles_go_from_strike_to_strike():
     nobody = replace(take, tracked=np.zeros_like(take.tracked))
     none = gait_cycles(nobody, joint_angles(nobody), 0, "left")
     assert len(none.deg) == 0 and np.isnan(none.mean_deg).all() and np.isnan(none.band_deg).all()
+
+
+def test_a_foot_that_stirs_where_it_stands_has_not_come_down_again():
+    """Noise of some centimetres is quicker than what stands; a step as quick goes farther."""
+    shape, time_s = person(), np.arange(180) / 60
+    theta = np.zeros((1, 180, PAPER21.pose_size))
+    theta[0, :, 1] = shape.standing_root_height_m
+    for metres, strikes in ((0.06, 0), (0.3, 1)):
+        theta[0, :, 0] = metres * np.clip((time_s - 1.5) / 0.15, 0, 1)
+        take = take_of(theta, [shape], names=("a",))
+        down = [event for event in foot_events(take, 0) if event.side == "left" and event.strikes]
+        assert len(down) == strikes
 
 
 def fusecap_angles(*arguments):

@@ -14,7 +14,14 @@ import typer
 from typer.testing import CliRunner
 
 from doc_commands import PAGES, ROOT, blocks, commands, commands_in, words
+from fusecap.body.landmarks import landmark_set_named
+from fusecap.body.motion_model import load_demo_motion
+from fusecap.body.shape import REFERENCE_HEIGHT_M, BodyShape
+from fusecap.body.skeleton import PAPER21
 from fusecap.cli import app
+from fusecap.evaluate.imu_noise import IMUS_6
+from fusecap.evaluate.simulated_session import write_session
+from fusecap.evaluate.simulator import Person, camera_ring, simulate
 
 STARTS = [page for page in PAGES if page.name.startswith("start_")]
 
@@ -69,9 +76,22 @@ def test_misuse_is_seen():
     assert not misuse("fusecap calibrate --help") and not misuse("fusecap solve duo --anyway")
 
 
+def own_recording(folder: Path) -> None:
+    """Keypoints for videos, cameras, and sensors of which nothing is known but their files."""
+    motion = load_demo_motion()
+    shape = BodyShape.from_height(PAPER21, REFERENCE_HEIGHT_M)
+    anna = Person(name="anna", shape=shape, theta=motion.theta[0, :400], imu_bones=IMUS_6)
+    made = simulate(
+        [anna], camera_ring(4), landmark_set_named("body25"), rate_hz=motion.rate_hz, seed=0
+    )
+    write_session(made, folder)
+    (folder / "session.toml").unlink()
+
+
 def test_the_first_steps_run_as_printed(tmp_path_factory, monkeypatch):
     """Every command and every piece of Python of the three pages, one after the other."""
     monkeypatch.chdir(tmp_path_factory.mktemp("first"))
+    own_recording(Path("trial"))
     done: set[str] = set()
     for page in STARTS:
         for block in blocks(page):
@@ -85,4 +105,8 @@ def test_the_first_steps_run_as_printed(tmp_path_factory, monkeypatch):
                 assert ended.exit_code == 0, (page.name, command, ended.output, ended.exception)
     made = {path.name for path in Path("scene").iterdir()}
     assert {"demo.glb", "demo_anna.trc", "demo_angles.csv", "demo_angles_anna.png"} <= made
-    assert len(done) == 10
+    assert "imu_calibration.toml" in Path("trial/session.toml").read_text()
+    assert {"trial_angles.csv", "trial_subject.c3d"} <= {
+        path.name for path in Path("trial").iterdir()
+    }
+    assert len(done) == 16

@@ -64,6 +64,15 @@ def test_draft_of_keypoints_and_sensors_is_a_session_that_loads(tmp_path):
     assert "00B4.csv" in (tmp_path / "session.toml").read_text()
 
 
+@pytest.mark.parametrize(("accel", "up"), [("0,9.8,0", "y"), ("0,0,9.8", "z"), ("0,-9.8,0", "z")])
+def test_up_axis_of_sensors_is_read_from_their_accelerations(tmp_path, accel, up):
+    rows = "".join(f"{row / 60},1,0,0,0,{accel}\n" for row in range(20))
+    for bone in ("head", "hips"):
+        (tmp_path / f"{bone}.csv").write_text(f"time_s,qw,qx,qy,qz,ax,ay,az\n{rows}")
+    (tmp_path / "session.toml").write_text(draft(survey(tmp_path)))
+    assert [imu.imu_up for imu in load_session(tmp_path).subjects[0].imus] == [up, up]
+
+
 def test_command_writes_once_and_never_over_a_session(tmp_path):
     (tmp_path / "cam1.mp4").write_bytes(b"")
     result = CliRunner().invoke(app, ["init", str(tmp_path)])

@@ -22,6 +22,8 @@ from fusecap.take import Take
 
 _LOW_M, _SLOW_M_S = 0.15, 0.35
 _SHORT_S = 0.1
+_STIRS_M = 0.05
+"""A foot within this of where it stood has not left."""
 _STAYS = 0.3
 """Share of the floor's speed below which hips get nowhere."""
 _STILL = np.zeros(3)
@@ -45,11 +47,14 @@ def standing(take: Take, subject: int, side: str) -> Bool[np.ndarray, " t"]:
     stands = np.zeros(len(tracked), dtype=bool)
     if len(tracked) < 2:
         return stands
+    places = []
     for bone in ("foot", "toes"):
         place, velocity = _moves(take, subject, f"{side}_{bone}")
         slow = np.linalg.norm(velocity, axis=1) < _SLOW_M_S
         stands |= slow & (place[:, 1] < _LOW_M)
-    return _without_short(stands & tracked, max(1, round(_SHORT_S * take.rate_hz))) & tracked
+        places.append(place)
+    stands = _without_short(stands & tracked, max(1, round(_SHORT_S * take.rate_hz)))
+    return _without_stirring(stands, np.stack(places)) & tracked
 
 
 def on_floor(take: Take, subject: int, side: str) -> Bool[np.ndarray, " t"]:
@@ -113,6 +118,21 @@ def _moves(
     """A joint's place [m] and velocity [m/s]; there are two frames at least."""
     place = take.bone_position_in_world_m[subject, :, take.skeleton.bone(bone)]
     return place, np.gradient(place, take.time_s, axis=0)
+
+
+def _without_stirring(
+    stands: Bool[np.ndarray, " t"], places_m: Float[np.ndarray, "p t 3"]
+) -> Bool[np.ndarray, " t"]:
+    """Between two stances whoever's foot stays about where both are has not stepped."""
+    stands = stands.copy()
+    for first, end in pairwise(np.flatnonzero(np.diff(stands)) + 1):
+        if stands[first]:
+            continue
+        between = places_m[:, first:end]
+        both = (places_m[:, first - 1] + places_m[:, end]) / 2
+        if (np.linalg.norm(between - both[:, None], axis=2).max(axis=1) < _STIRS_M).any():
+            stands[first:end] = True
+    return stands
 
 
 def _without_short(values: Bool[np.ndarray, " t"], frames: int) -> Bool[np.ndarray, " t"]:

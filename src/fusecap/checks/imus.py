@@ -15,6 +15,7 @@ from fusecap.sources.session_sensors import mount
 from fusecap.types import GRAVITY_M_S2
 
 FROZEN_S = 0.5
+_OTHER_UP = {"y": "z", "z": "y"}
 
 
 def check_imus(
@@ -22,7 +23,7 @@ def check_imus(
 ) -> None:
     """Of every sensor that could be read, and how it sits on its bone."""
     for subject in session.subjects:
-        unmounted = []
+        unmounted, other_up = [], []
         for imu, track in zip(subject.imus, tracks.get(subject.name, ()), strict=True):
             if track is None:
                 continue
@@ -36,8 +37,18 @@ def check_imus(
                     findings.add("error", where, str(error).removeprefix(f"{where}: "))
                     continue
             _check_imu(where, imu, track, findings)
+            if track.up_axis == _OTHER_UP[imu.imu_up]:
+                other_up.append(imu)
         if unmounted:
             _add_unmounted(subject.name, unmounted, bool(session.cameras), findings)
+        for up in {imu.imu_up: None for imu in other_up}:
+            bones = [imu.bone for imu in other_up if imu.imu_up == up]
+            findings.add(
+                "warning",
+                f"sensors of '{subject.name}'",
+                f"imu_up is {up}, gravity points along {_OTHER_UP[up]}: {', '.join(bones)}",
+                f'set imu_up = "{_OTHER_UP[up]}" in their tables',
+            )
 
 
 def _add_unmounted(subject: str, bones: list[str], cameras: bool, findings: Findings) -> None:
@@ -122,10 +133,10 @@ def _check_gravity(where: str, imu: ImuSettings, track: ImuTrack, findings: Find
     else:
         up = np.array([0.0, 1.0, 0.0] if imu.imu_up == "y" else [0.0, 0.0, 1.0])
         angle = np.degrees(np.arccos(np.clip(force @ up / np.linalg.norm(force), -1, 1)))
-        if angle > 15:
+        if angle > 15 and track.up_axis != _OTHER_UP[imu.imu_up]:
             findings.add(
                 "warning",
                 where,
                 f"gravity points {angle:.0f} deg away from the sensor world's {imu.imu_up} axis",
-                "check imu_up, and that the quaternion is w, x, y, z from sensor to world",
+                "check that its quaternion is w, x, y, z from sensor to world",
             )

@@ -11,7 +11,7 @@ from pathlib import Path
 from fusecap.errors import FusecapError, InputError
 from fusecap.sources.calibration_files.loader import load_rig, may_be_calibration
 from fusecap.sources.calibration_files.plausibility import SAME_PLACE_M, camera_spread
-from fusecap.sources.imu_files import imu_format_of, sensor_names
+from fusecap.sources.imu_files import imu_format_of, read_imu, sensor_names
 from fusecap.sources.keypoint_files import sets_in
 from fusecap.sources.sensor_bones import bone_of
 from fusecap.sources.video import VIDEO_SUFFIXES
@@ -38,6 +38,8 @@ class FoundSensor:
     """Its name in a file that holds several."""
     bone: str | None
     """As far as names tell."""
+    up: str | None
+    """Axis of its reference world that gravity is along, as the folder's first such file tells."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,7 +88,7 @@ def survey(folder: Path) -> FolderSurvey:
         calibration=calibration,
         other_calibrations=others,
         cameras=cameras,
-        sensors=tuple(sensor for file in files for sensor in _sensors(folder, file)),
+        sensors=_sensors(folder, files),
     )
 
 
@@ -157,17 +159,35 @@ def _keypoint_format(folder: Path, keypoints: dict[str, Path]) -> str | None:
     return None
 
 
-def _sensors(folder: Path, file: Path) -> list[FoundSensor]:
-    format = imu_format_of(file)
-    if format is None:
-        return []
+def _sensors(folder: Path, files: list[Path]) -> tuple[FoundSensor, ...]:
+    found: list[FoundSensor] = []
+    ups: dict[tuple[Path, str], str | None] = {}
+    for file in files:
+        format = imu_format_of(file)
+        if format is None:
+            continue
+        try:
+            names: tuple[str | None, ...] = sensor_names(file, format) or (None,)
+        except InputError:
+            continue
+        system = (file.parent, format)
+        if system not in ups:
+            ups[system] = _up(file, format, names[0])
+        found += [
+            FoundSensor(
+                file=file.relative_to(folder),
+                format=format,
+                sensor=name,
+                bone=bone_of(name or file.stem),
+                up=ups[system],
+            )
+            for name in names
+        ]
+    return tuple(found)
+
+
+def _up(file: Path, format: str, sensor: str | None) -> str | None:
     try:
-        names = sensor_names(file, format)
-    except InputError:
-        return []
-    path = file.relative_to(folder)
-    if not names:
-        return [FoundSensor(file=path, format=format, sensor=None, bone=bone_of(file.stem))]
-    return [
-        FoundSensor(file=path, format=format, sensor=name, bone=bone_of(name)) for name in names
-    ]
+        return read_imu(file, format=format, sensor=sensor).up_axis
+    except FusecapError:
+        return None

@@ -91,6 +91,8 @@ def _subject(found: FolderSurvey) -> Iterator[str]:
         yield f"{mark}format = {quoted(sensor.format)}"
         if sensor.sensor is not None:
             yield f"{mark}sensor = {quoted(sensor.sensor)}"
+        if sensor.up == "y":
+            yield f'{mark}imu_up = "y"   # its accelerations point there'
         if known:
             taken.add(str(sensor.bone))
 

@@ -13,7 +13,6 @@ from fusecap.calibrate.imus.reference import ReferenceMotion
 from fusecap.calibrate.imus.speeds import lag_s
 from fusecap.calibrate.imus.tpose import TPose
 from fusecap.errors import InputError
-from fusecap.geometry.quaternions import from_wxyz
 from fusecap.sources.imu_files.track import ImuTrack
 from fusecap.sources.session import ImuSettings
 from fusecap.sources.synchronizer import MountedImu, resample_imus, world_from_imu_world
@@ -86,14 +85,8 @@ def why_unusable(
 
 def _wrong_up(worn: Worn) -> str:
     """Over a recording the specific force averages to gravity, which is up."""
-    accel = worn.track.accel_m_s2
-    known = np.isfinite(accel).all(axis=1)
-    if known.sum() < 10:
-        return ""
-    force = from_wxyz(worn.track.orientation_wxyz[known]).apply(accel[known]).mean(axis=0)
-    axis = int(np.argmax(np.abs(force)))
-    found = f"{'-' if force[axis] < 0 else ''}{'xyz'[axis]}"
-    if np.linalg.norm(force) < 5.0 or found == worn.settings.imu_up:
+    found = worn.track.up_axis
+    if found is None or found == worn.settings.imu_up:
         return ""
     hint = f'set imu_up = "{found}"' if found in ("y", "z") else "check the axes of its file"
     return (

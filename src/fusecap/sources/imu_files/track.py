@@ -57,6 +57,22 @@ class ImuTrack:
         return float(1.0 / np.median(np.diff(self.times_s)))
 
     @property
+    def up_axis(self) -> str | None:
+        """Axis of the imu_world that gravity's reaction is nearest to, "y" or "-z" say.
+
+        None with few accelerations, or where gravity has been taken out of them.
+        """
+        measured = np.isfinite(self.accel_m_s2).all(axis=1)
+        if np.count_nonzero(measured) < 10:
+            return None
+        turned = from_wxyz(self.orientation_wxyz[measured]).apply(self.accel_m_s2[measured])
+        force = np.median(turned, axis=0)
+        axis = int(np.argmax(np.abs(force)))
+        if np.linalg.norm(force) < 0.5 * GRAVITY_M_S2:
+            return None
+        return f"{'-' if force[axis] < 0 else ''}{'xyz'[axis]}"
+
+    @property
     def gaps(self) -> np.ndarray:
         """(N - 1,) how many samples were lost after each but the last."""
         step = np.diff(self.times_s)
