@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from dataclasses import replace
 
@@ -22,6 +23,13 @@ from tiny_networks import constant_network, fails_on_batches, red_blob_network
 
 BOTH = pytest.mark.parametrize("runtime", ["onnxruntime", "openvino"])
 GREY_640 = np.full((640, 320, 3), 90, np.uint8)
+
+
+def test_onnx_runtime_tells_nobody_what_is_run(tmp_path, monkeypatch):
+    path = constant_network(tmp_path / "n.onnx", ("n", 3, 8, 8), {"a": np.zeros((1, 1))})
+    monkeypatch.delenv("ORT_DISABLE_TELEMETRY", raising=False)
+    open_network(path, "onnxruntime")
+    assert os.environ["ORT_DISABLE_TELEMETRY"] == "1"
 
 
 @BOTH

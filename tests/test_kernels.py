@@ -7,15 +7,25 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from numba.core.caching import CacheImpl
 from scipy.spatial.transform import Rotation
 
 from derivatives import assert_jacobian
 from fusecap.body.pose import forward_kinematics
 from fusecap.body.shape import BodyShape
 from fusecap.body.skeleton import EXTENDED23, PAPER21
-from fusecap.kernels import cholesky, groups, kinematics, lie, projection
+from fusecap.kernels import cholesky, groups, jit, kinematics, lie, projection
 from fusecap.kernels.terms.orientation import relative_quaternion
 from scenes import random_pose, ring
+
+
+def test_kernels_compile_where_nothing_can_keep_them(monkeypatch, caplog):
+    monkeypatch.setattr(CacheImpl, "_locator_classes", [])
+    monkeypatch.setattr(jit, "_announced", False)
+    twice = [jit.kernel("float64(float64)")(lambda x: 2.0 * x) for _ in range(2)]
+    assert twice[0](2.0) == twice[1](2.0) == 4.0
+    assert [record.message.count("NUMBA_CACHE_DIR") for record in caplog.records] == [1]
+
 
 vectors = arrays(np.float64, 3, elements=st.floats(-6.0, 6.0))
 scales = st.sampled_from([1.0, 1e-3, 1e-5, 1e-9, 0.0])

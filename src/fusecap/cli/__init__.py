@@ -7,6 +7,7 @@ one JSON object, also when the command fails.
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 from importlib import metadata
@@ -46,6 +47,9 @@ from fusecap.cli import (
 from fusecap.cli.common import print_json
 from fusecap.cli.terminal import err, remark
 from fusecap.errors import FusecapError
+
+# It warns wherever it cannot keep its list of fonts, as in a home that is read only.
+logging.getLogger("matplotlib").setLevel(logging.ERROR)
 
 app = typer.Typer(
     name="fusecap",

@@ -46,21 +46,36 @@ def _drop_stale_cache() -> None:
         stamp_file.write_text(stamp)
 
 
+def _announce(how_often: str) -> None:
+    global _announced
+    if not _announced:
+        _announced = True
+        _log.warning("compiling the numerical kernels for this machine: %s", how_often)
+
+
+def _compiled(signature: Any, function: Callable[..., Any], *, cache: bool) -> Any:
+    return numba.njit(
+        signature,
+        cache=cache,
+        nogil=True,
+        error_model="numpy",
+        fastmath={"contract", "reassoc", "nsz"},
+    )(function)
+
+
 def kernel(signature: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Compile a function for one explicit signature; says so once when the cache is cold."""
 
     def compile_now(function: Callable[..., Any]) -> Callable[..., Any]:
-        global _announced
-        compiled = numba.njit(
-            signature,
-            cache=True,
-            nogil=True,
-            error_model="numpy",
-            fastmath={"contract", "reassoc", "nsz"},
-        )(function)
-        if not _announced and getattr(compiled, "stats", None) and compiled.stats.cache_misses:
-            _announced = True
-            _log.warning("compiling the numerical kernels for this machine: once, about a minute")
+        try:
+            compiled = _compiled(signature, function, cache=True)
+        except RuntimeError as error:
+            if "no locator available" not in str(error):
+                raise
+            _announce("every time, as no folder can keep them: set NUMBA_CACHE_DIR to one that can")
+            return _compiled(signature, function, cache=False)
+        if getattr(compiled, "stats", None) and compiled.stats.cache_misses:
+            _announce("once, about a minute")
         return compiled
 
     return compile_now

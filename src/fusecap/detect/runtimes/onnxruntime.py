@@ -23,6 +23,8 @@ class OnnxNetwork:
     """One session; not shared between threads."""
 
     def __init__(self, path: Path, threads: int | None = None) -> None:
+        # Its wheels tell Microsoft what is run, unless this stands before they are loaded.
+        os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
         import onnxruntime
 
         options = onnxruntime.SessionOptions()
