@@ -35,6 +35,7 @@ from fusecap.recording.index import RecordingIndex
 from fusecap.recording.layout import DECODERS, POSE, Known, pose_message
 from fusecap.recording.reader import RecordedEvent, RecordedPose, Recording
 from fusecap.recording.setup_json import setup_from_values, setup_values
+from fusecap.recording.told import told_by
 from fusecap.recording.writer import RecordingWriter
 from fusecap.setup import SessionSetup
 from fusecap.sources.session import Session
@@ -719,6 +720,90 @@ def test_records_are_found_as_struct_finds_them(records, tail):
     expected = np.array(records_by_hand(bytes(data)), np.uint64).reshape(-1, COLUMNS)
     assert count == len(expected)
     assert (rows[:count].view(np.uint64) == expected).all() and not rows[count:].any()
+
+
+# The index that a finished recording tells
+
+
+def places(index: RecordingIndex) -> dict[str, list[tuple[int, int, int]]]:
+    of_all = index.poses | index.keypoints
+    return {
+        name: [(*some.at(row), some.times_ns[row]) for row in range(len(some.times_ns))]
+        for name, some in of_all.items()
+    }
+
+
+def test_what_a_recording_tells_is_what_is_found_in_it(whole, tmp_path):
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(whole.read_bytes()[:-1])
+    told, found = (RecordingIndex(Recording(path), keypoints_hz=10) for path in (whole, cut))
+    assert told_by(whole) is not None and told_by(cut) is None
+    assert places(told) == places(found) and len(places(told)) > 4
+    assert {name: body.height_m for name, body in told.bodies.items()} == {
+        name: body.height_m for name, body in found.bodies.items()
+    }
+
+
+def test_a_recording_of_another_tool_tells_nothing(short, tmp_path):
+    """Its index lacks the times; that of ours with other counts of events is not believed."""
+    data = short.read_bytes()
+    for spoilt in (
+        data.replace(b"fusecap times /", b"fusecap tunes /"),
+        data.replace(b"events", b"evints"),
+    ):
+        path = tmp_path / "other.mcap"
+        path.write_bytes(spoilt)
+        assert spoilt != data and told_by(path) is None
+        assert places(RecordingIndex(Recording(path))) == places(RecordingIndex(Recording(short)))
+
+
+def test_a_spoilt_index_never_shows_another_pose(short, tmp_path):
+    """Bytes of the end changed, with its checksum made right: a pose is what it was, or gone."""
+    data = short.read_bytes()
+    right = RecordingIndex(Recording(short))
+    poses = {
+        (name, pose.timestamp_ns): pose.theta.tobytes()
+        for name, some in right.poses.items()
+        for pose in (right.read(some, row) for row in range(len(some.times_ns)))
+        if isinstance(pose, RecordedPose)
+    }
+    (summary_at,) = struct.unpack_from("<Q", data, len(data) - 28)
+    index_at = data.index(bytes([Opcode.MESSAGE_INDEX]) + struct.pack("<Q", 6 + 16))
+    rng = np.random.default_rng(0)
+    believed = 0
+    for trial in range(150):
+        spoilt = bytearray(data)
+        low, high = ((summary_at, len(data) - 37), (index_at, summary_at))[trial % 2]
+        for at in rng.integers(low, high, 3):
+            spoilt[at] = rng.integers(256)
+        summary = bytes(spoilt[summary_at:-8])
+        spoilt[-12:-8] = struct.pack("<I", zlib.crc32(summary[:-4]))
+        path = tmp_path / "spoilt.mcap"
+        path.write_bytes(spoilt)
+        believed += told_by(path) is not None
+        try:
+            index = RecordingIndex(Recording(path))
+        except InputError:
+            continue
+        for name, some in index.poses.items():
+            for row in range(len(some.times_ns)):
+                pose = index.read(some, row)
+                if isinstance(pose, RecordedPose):
+                    assert poses[name, pose.timestamp_ns] == pose.theta.tobytes()
+    assert 20 < believed < 140
+
+
+def test_an_index_that_is_named_again_and_again_is_not_read_as_often(short, tmp_path):
+    data = short.read_bytes()
+    (summary_at,) = struct.unpack_from("<Q", data, len(data) - 28)
+    rows = records_by_hand(data[summary_at:-37])
+    _, first, end, *_ = next(row for row in rows if row[0] == Opcode.CHUNK_INDEX)
+    copies = data[summary_at + first - 9 : summary_at + end] * 20_000
+    bomb = data[summary_at:-37] + copies + data[-37:-12]
+    path = tmp_path / "bomb.mcap"
+    path.write_bytes(data[:summary_at] + bomb + struct.pack("<I", zlib.crc32(bomb)) + data[-8:])
+    assert told_by(path) is None
+    assert places(RecordingIndex(Recording(path))) == places(RecordingIndex(Recording(short)))
 
 
 def test_times_beyond_any_clock_are_survived(whole, tmp_path):

@@ -1,24 +1,32 @@
 """Where a recording's poses and keypoints are, so that those of one instant can be read alone.
 
-One pass over the file, in which no message is read but bodies; 40 bytes are kept of a pose.
+A finished recording tells it at its end; of another one all is unpacked once. 24 bytes are kept of
+a message.
 """
 
 from __future__ import annotations
 
+import struct
 from array import array
 from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Int
+from mcap.opcode import Opcode
 
 from fusecap.body.shape import BodyShape
 from fusecap.progress import Progress
 from fusecap.recording.layout import BODY, EVENTS, KEYPOINTS, POSE, RecordedBody
-from fusecap.recording.reader import Entry, EventNumbers, Item, Messages, Recording
+from fusecap.recording.reader import Entry, EventNumbers, Item, Loss, Messages, Recording
+from fusecap.recording.told import INDEXED, Topic, told_by
 
 _RECORDS_KEPT = 8
 """Unpacked; a run closes one twice a second."""
+_MESSAGE = struct.Struct("<BQHIQQ")
+"""Opcode, length, channel, sequence, log time, publish time; the content follows."""
+_BEFORE_CONTENT = _MESSAGE.size - 9
+"""Of what the length counts."""
 
 
 class Places:
@@ -28,27 +36,29 @@ class Places:
         self.schema = schema
         self.times_ns = array("q")
         """Of the samples, on the session's clock."""
-        self.numbers = array("q")
-        self._records, self._starts, self._lengths = array("q"), array("q"), array("q")
+        self._records, self._starts = array("q"), array("q")
 
     def add(
-        self, some: Messages, rows: Int[np.ndarray, " n"], times_ns: Int[np.ndarray, " n"]
+        self,
+        record_at: Int[np.ndarray, " n"],
+        start: Int[np.ndarray, " n"],
+        times_ns: Int[np.ndarray, " n"],
     ) -> None:
-        """The next ones, at these times."""
-        lengths = some.end[rows] - some.start[rows]
+        """The next ones: of which record in the file, from where in it, when."""
+        self._records.frombytes(record_at.tobytes())
+        self._starts.frombytes(start.tobytes())
         self.times_ns.frombytes(times_ns.tobytes())
-        self.numbers.frombytes(some.sequence[rows].tobytes())
-        self._records.frombytes(np.full(len(rows), some.record_at).tobytes())
-        self._starts.frombytes(some.start[rows].tobytes())
-        self._lengths.frombytes(lengths.tobytes())
 
-    def at(self, row: int) -> tuple[int, int, int]:
-        """Of which record, from where in it, how many bytes."""
-        return self._records[row], self._starts[row], self._lengths[row]
+    def at(self, row: int) -> tuple[int, int]:
+        """Of which record, from where in it."""
+        return self._records[row], self._starts[row]
 
 
 class RecordingIndex:
-    """Of a recording, whose `loss` it completes; raises `InputError`."""
+    """Of a recording, whose `loss` it completes; raises `InputError`.
+
+    Damage to a recording that tells its own index shows when the messages there are read.
+    """
 
     def __init__(
         self, recording: Recording, *, keypoints_hz: float = 0.0, progress: Progress | None = None
@@ -61,60 +71,98 @@ class RecordingIndex:
         self.bodies: dict[str, BodyShape] = {}
         """The last of each person."""
         self._recording = recording
+        self._keypoints_hz = keypoints_hz
         self._unpacked = lru_cache(_RECORDS_KEPT)(recording.unpacked)
-        numbers = EventNumbers()
-        for some in recording.messages(progress, numbers):
-            self._add(some, numbers, keypoints_hz)
-        recording.loss.missing_events = numbers.missing
+        bodies: dict[str, Places] = {}
+        told = told_by(recording.path)
+        if told is None:
+            numbers = EventNumbers()
+            for some in recording.messages(progress, numbers):
+                for topic in _topics(some, numbers):
+                    self._add(topic, bodies)
+            recording.loss.missing_events = numbers.missing
+        else:
+            recording.loss = Loss(finished=True, note=told.note)
+            for topic in told.topics:
+                self._add(topic, bodies)
+        for places in bodies.values():
+            for row in reversed(range(len(places.times_ns))):
+                body = self.read(places, row)
+                if isinstance(body, RecordedBody):
+                    self.bodies[body.name] = body.shape
+                    break
 
-    def _add(self, some: Messages, numbers: EventNumbers, keypoints_hz: float) -> None:
-        channels, first, which = np.unique(some.channel, return_index=True, return_inverse=True)
-        names = [some.names.get(channel, ("", "")) for channel in channels.tolist()]
-        is_event = np.array([schema in EVENTS for schema, _ in names], dtype=bool)
-        numbers.take_all(some.sequence[is_event[which]])
-        topics: dict[tuple[str, str], list[int]] = {}
-        for index in np.argsort(first).tolist():
-            topics.setdefault(names[index], []).append(index)
+    def _add(self, topic: Topic, bodies: dict[str, Places]) -> None:
         ahead_ns = self._recording.unix_minus_session_ns
         latest_ns = np.iinfo(np.int64).max + min(ahead_ns, 0)
-        possible = (some.publish_ns >= 0) & (some.publish_ns <= latest_ns)
-        for (schema, topic), indices in topics.items():
-            if schema not in (POSE, BODY, KEYPOINTS):
-                continue
-            ours = np.isin(which, indices)
-            rows = np.flatnonzero(ours & possible)
-            self._recording.loss.malformed += int(ours.sum()) - len(rows)
-            if not len(rows):
-                continue
-            times_ns = some.publish_ns[rows] - ahead_ns
-            if schema == POSE:
-                name = topic.removeprefix("/pose/")
-                self.poses.setdefault(name, Places(POSE)).add(some, rows, times_ns)
-            elif schema == BODY:
-                for body in map(self._recording.read, map(some.entry, rows.tolist())):
-                    if isinstance(body, RecordedBody):
-                        self.bodies[body.name] = body.shape
-            elif keypoints_hz:
-                places = self.keypoints.setdefault(topic, Places(KEYPOINTS))
-                kept = _apart(times_ns, 1e9 / keypoints_hz, places.times_ns[-1:])
-                places.add(some, rows[kept], times_ns[kept])
+        possible = (topic.publish_ns >= 0) & (topic.publish_ns <= latest_ns)
+        rows = np.flatnonzero(possible)
+        self._recording.loss.malformed += len(possible) - len(rows)
+        if not len(rows):
+            return
+        times_ns = topic.publish_ns[rows] - ahead_ns
+        if topic.schema == POSE:
+            places = self.poses.setdefault(topic.name.removeprefix("/pose/"), Places(POSE))
+        elif topic.schema == BODY:
+            places = bodies.setdefault(topic.name, Places(BODY))
+        elif self._keypoints_hz:
+            places = self.keypoints.setdefault(topic.name, Places(KEYPOINTS))
+            kept = _apart(times_ns, 1e9 / self._keypoints_hz, places.times_ns[-1:])
+            rows, times_ns = rows[kept], times_ns[kept]
+        else:
+            return
+        places.add(topic.record_at[rows], topic.start[rows], times_ns)
 
     def read(self, places: Places, row: int) -> Item | None:
-        """A message; None for one that is malformed, or no longer there."""
-        record_at, start, length = places.at(row)
+        """A message; None for one that is malformed, or is not there as the index says."""
+        record_at, start = places.at(row)
         data = self._unpacked(record_at)
+        try:
+            opcode, length, _, sequence, _, publish_ns = _MESSAGE.unpack_from(data, start)
+        except struct.error:
+            opcode = length = sequence = publish_ns = 0
+        publish_ns -= self._recording.unix_minus_session_ns
+        if opcode != Opcode.MESSAGE or publish_ns != places.times_ns[row]:
+            self._recording.loss.malformed += 1
+            return None
+        first = start + _MESSAGE.size
         return self._recording.read(
             Entry(
                 schema=places.schema,
                 topic="",
-                sequence=places.numbers[row],
+                sequence=sequence,
                 log_ns=0,
-                publish_ns=0,
+                publish_ns=publish_ns,
                 record_at=record_at,
-                start=start,
-                content=data[start : start + length],
+                start=first,
+                content=data[first : first + length - _BEFORE_CONTENT],
             )
         )
+
+
+def _topics(some: Messages, numbers: EventNumbers) -> list[Topic]:
+    """Those of `INDEXED` schemas, in the order of their first message; `numbers` takes events'."""
+    channels, first, which = np.unique(some.channel, return_index=True, return_inverse=True)
+    names = [some.names.get(channel, ("", "")) for channel in channels.tolist()]
+    is_event = np.array([schema in EVENTS for schema, _ in names], dtype=bool)
+    numbers.take_all(some.sequence[is_event[which]])
+    topics: dict[tuple[str, str], list[int]] = {}
+    for index in np.argsort(first).tolist():
+        if names[index][0] in INDEXED:
+            topics.setdefault(names[index], []).append(index)
+    found = []
+    for (schema, name), indices in topics.items():
+        rows = np.flatnonzero(np.isin(which, indices))
+        found.append(
+            Topic(
+                schema=schema,
+                name=name,
+                record_at=np.full(len(rows), some.record_at, np.int64),
+                start=some.start[rows] - _MESSAGE.size,
+                publish_ns=some.publish_ns[rows],
+            )
+        )
+    return found
 
 
 def _apart(times_ns: Int[np.ndarray, " n"], period_ns: float, last: Sequence[int]) -> list[int]:

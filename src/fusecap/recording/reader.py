@@ -39,15 +39,15 @@ MAX_BYTES = 256 << 20
 """Of one record, and of what a chunk unpacks to."""
 MAX_RATIO = 100
 """Of what all chunks unpack to, `MAX_BYTES` aside, to the file; a run's is about 3."""
-_MAGIC = b"\x89MCAP0\r\n"
-_RECORD = struct.Struct("<BQ")
+MAGIC = b"\x89MCAP0\r\n"
+RECORD = struct.Struct("<BQ")
 _BETWEEN = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA)
 _TOLD = (*_BETWEEN, Opcode.MESSAGE, Opcode.CHUNK)
 _NAME = 1000
 """Of a schema or a channel: so much is kept."""
 _MESSAGE = struct.Struct("<HIQQ")
 """Channel, sequence, log time, publish time; the content follows."""
-_BROKEN = (
+BROKEN = (
     ValueError,
     KeyError,
     TypeError,
@@ -183,7 +183,7 @@ class Recording:
             self.setup: Mapping[str, Any] = json.loads(header["setup"])
             """Plain values: what the run knew before the first event."""
             self._known = Known.of(self.setup)
-        except _BROKEN as error:
+        except BROKEN as error:
             raise InputError(f"{self.path}: its header is damaged ({error!r})") from None
 
     def items(self, progress: Progress | None = None) -> Iterator[Item]:
@@ -211,7 +211,7 @@ class Recording:
         Raises `InputError` for a file that unpacks to `MAX_RATIO` times its size.
         """
         self.loss = loss = Loss()
-        said = _Said()
+        said = Said()
         most = MAX_BYTES + MAX_RATIO * self.path.stat().st_size
         unpacked = 0
         with self._opened() as file:
@@ -227,7 +227,7 @@ class Recording:
                             "its size; no run leaves such a recording"
                         )
                     yield from _messages_in(record_at, data, said, loss)
-                except (*_BROKEN, zstandard.ZstdError, MemoryError):
+                except (*BROKEN, zstandard.ZstdError, MemoryError):
                     loss.broken_chunks += 1
         loss.note = said.note
         if numbers is not None:
@@ -252,7 +252,7 @@ class Recording:
             if isinstance(decoded, RecordedBody):
                 return decoded
             return RecordedPose(number=entry.sequence, **decoded)
-        except (*_BROKEN, MotionError, InputError):
+        except (*BROKEN, MotionError, InputError):
             self.loss.malformed += 1
             return None
 
@@ -260,13 +260,13 @@ class Recording:
         """The record that an entry names; empty where it is no longer there."""
         with self._opened() as file:
             file.seek(record_at)
-            head = file.read(_RECORD.size)
+            head = file.read(RECORD.size)
             try:
-                opcode, length = _RECORD.unpack(head)
+                opcode, length = RECORD.unpack(head)
                 if length > MAX_BYTES:
                     raise ValueError("a record that is too long")
                 return unpacked_record(opcode, file.read(length))
-            except (*_BROKEN, zstandard.ZstdError, MemoryError):
+            except (*BROKEN, zstandard.ZstdError, MemoryError):
                 return memoryview(b"")
 
     def sha256(self) -> str:
@@ -284,7 +284,7 @@ class Recording:
                             return record.metadata
                     if opcode == Opcode.CHUNK:
                         break
-            except _BROKEN:
+            except BROKEN:
                 pass
         raise InputError(
             f"{self.path} holds no recording of fusecap: an MCAP log without its header, or cut "
@@ -299,24 +299,24 @@ class Recording:
     ) -> Iterator[tuple[int, int, bytes]]:
         """Place, opcode and content of every record that is there whole, up to the data's end."""
         size = self.path.stat().st_size
-        if file.read(len(_MAGIC)) != _MAGIC:
+        if file.read(len(MAGIC)) != MAGIC:
             raise InputError(f"{self.path} is not an MCAP log: its first bytes are others")
-        at = len(_MAGIC)
-        while len(head := file.read(_RECORD.size)) == _RECORD.size:
-            opcode, length = _RECORD.unpack(head)
+        at = len(MAGIC)
+        while len(head := file.read(RECORD.size)) == RECORD.size:
+            opcode, length = RECORD.unpack(head)
             if opcode == Opcode.DATA_END and length == 4:
                 loss.finished = True
                 return
-            if length > min(MAX_BYTES, size - at - _RECORD.size):
+            if length > min(MAX_BYTES, size - at - RECORD.size):
                 break
             yield at, opcode, file.read(length)
-            at += _RECORD.size + length
+            at += RECORD.size + length
             if progress is not None:
                 progress(f"reading {self.path.name}", at, size)
         loss.unread_bytes = size - at
 
 
-class _Said:
+class Said:
     """What the records between the messages say."""
 
     def __init__(self) -> None:
@@ -381,7 +381,7 @@ class EventNumbers:
         return max(self._last, self._stated) - self._count
 
 
-def _messages_in(record_at: int, data: memoryview, said: _Said, loss: Loss) -> Iterator[Messages]:
+def _messages_in(record_at: int, data: memoryview, said: Said, loss: Loss) -> Iterator[Messages]:
     """Those of one record, after `said` has heard it; raises `ValueError` after what is whole."""
     content = np.frombuffer(data, np.uint8)
     none = np.empty((0, COLUMNS), np.int64)
@@ -390,7 +390,7 @@ def _messages_in(record_at: int, data: memoryview, said: _Said, loss: Loss) -> I
     for opcode, start, end in rows[np.isin(rows[:, 0], _BETWEEN), :3].tolist():
         try:
             said.hear(opcode, data[start:end])
-        except _BROKEN:
+        except BROKEN:
             loss.malformed += 1
     _, start, end, channel, sequence, log_ns, publish_ns = rows[rows[:, 0] == Opcode.MESSAGE].T
     yield Messages(
@@ -411,7 +411,7 @@ def _messages_in(record_at: int, data: memoryview, said: _Said, loss: Loss) -> I
 def unpacked_record(opcode: int, content: bytes) -> memoryview:
     """Records one after the other: those that a chunk holds, or the record itself."""
     if opcode != Opcode.CHUNK:
-        return memoryview(_RECORD.pack(opcode, len(content)) + content)
+        return memoryview(RECORD.pack(opcode, len(content)) + content)
     chunk = Chunk.read(ReadDataStream(BytesIO(content)))
     size = chunk.uncompressed_size
     data = chunk.data

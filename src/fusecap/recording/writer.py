@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import zlib
+from array import array
 from collections.abc import Iterable, Mapping, Sequence
 from importlib import metadata
 from typing import Any, BinaryIO
@@ -19,6 +20,7 @@ from mcap.writer import CompressionType, Writer
 from fusecap.body.shape import BodyShape
 from fusecap.recording import foxglove, layout
 from fusecap.recording.layout import END, FORMAT, HEADER
+from fusecap.recording.told import INDEXED, add_times
 from fusecap.types import CameraSample, Command, Estimate, Event, ImuSample, Tick
 
 SCENE_PERIOD_NS = 100_000_000
@@ -45,6 +47,8 @@ class RecordingWriter:
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
         self._bodies: dict[str, BodyShape] = {}
+        self._times_ns: dict[str, array[int]] = {}
+        """By topic; 8 bytes a pose and a picture."""
         self._scene_due_ns: int | None = None
         self._writer = Writer(file, compression=CompressionType.ZSTD)
         self._writer.start(library=f"fusecap {metadata.version('fusecap')}")
@@ -114,6 +118,7 @@ class RecordingWriter:
         """Indexes and footer; `note` says why it ends, where that was not asked for."""
         self._writer.flush()
         self._writer.add_metadata(END, {"events": str(self.events), "note": note})
+        add_times(self._writer, self._times_ns)
         self._writer.finish()
         self._writer.flush()
 
@@ -122,11 +127,16 @@ class RecordingWriter:
         if channel is None:
             channel = self._writer.register_channel(topic, "json", self._schema(schema))
             self._channels[topic] = channel
+            if schema in INDEXED:
+                self._times_ns[topic] = array("q")
+        publish_ns = self._unix_ns(sample_ns)
+        if topic in self._times_ns:
+            self._times_ns[topic].append(publish_ns)
         self._writer.add_message(
             channel,
             log_time=self._unix_ns(arrival_ns),
             data=text.encode(),
-            publish_time=self._unix_ns(sample_ns),
+            publish_time=publish_ns,
             sequence=self.events & 0xFFFFFFFF,
         )
 
