@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from fusecap.appearance import APPEARANCE_SIZE, by_part, difference, unknown
-from fusecap.associate.clothes import Looks
 from fusecap.associate.looks import MARGIN, OTHER, by_looks
+from fusecap.associate.looks import looks as nothing_seen
 from fusecap.batch.detect import detect_videos, loose_videos
 from fusecap.believable import believable_detections
 from fusecap.body.landmarks import landmark_set_named
@@ -253,7 +253,7 @@ def test_clothes_decide_by_a_margin_only():
 
 
 def test_what_is_seen_in_doubt_changes_nothing_known_until_it_is_believed():
-    looks = Looks(1)
+    looks = nothing_seen(1)
     red = by_part(shown(RED_AND_BLACK).astype(float))[None]
     blue = by_part(shown(BLUE_AND_WHITE).astype(float))[None]
     for _ in range(20):

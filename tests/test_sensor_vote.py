@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -187,7 +188,13 @@ class ToldVote(SensorVote):
 def cast_of(simulation, *names, **options):
     landmark_set = simulation.landmark_set
     subjects = [Subject(name=name) for name in names]
-    return Cast(subjects, simulation.rig, Anatomy(landmark_set), TrackerOptions(**options))
+    return Cast(
+        subjects,
+        simulation.rig,
+        Anatomy(landmark_set),
+        TrackerOptions(**options),
+        itertools.count(100),
+    )
 
 
 def standing_at(simulation, number, x_m, born_s, seen_s):
@@ -243,3 +250,45 @@ def test_a_missing_wearer_holds_back_those_who_may_be_it_and_nobody_else(
     cast.admit([newcomer, beside], now_ns, ToldVote({(3, "x"): misfit}))
     followed = dict(cast.followed())
     assert followed == ({admitted_as: newcomer} if admitted_as else {})
+
+
+def test_whoever_is_followed_under_another_wearers_name_gets_its_own_and_the_name_waits(simulation):
+    cast = cast_of(simulation, "x", "y", max_subjects=2)
+    body = standing_at(simulation, 1, 0.0, 0.0, 1.0)
+    cast.admit([body], 10**9, ToldVote({(1, "x"): 0.05, (1, "y"): 0.6}))
+    told = ToldVote({(1, "x"): 0.6, (1, "y"): 0.05})
+    renumbered = cast.pair_anew([body], told, 10**9)
+    assert dict(cast.followed()) == {"y": body} and renumbered == {1: body.track_id}
+    assert body.track_id != 1, "x keeps its identity"
+    wearer = standing_at(simulation, 7, 2.0, 0.5, 1.0)
+    cast.admit([body, wearer], 10**9, ToldVote({(7, "x"): 0.05, (7, "y"): 0.6}))
+    assert dict(cast.followed()) == {"x": wearer, "y": body} and wearer.track_id == 1
+
+
+@pytest.mark.parametrize("misfit", [0.05, 0.9])
+def test_sensors_name_whom_only_two_views_see_at_once(simulation, misfit):
+    cast = cast_of(simulation, "x", max_subjects=1)
+    newcomer = standing_at(simulation, 1, 0.0, 0.0, 0.3)
+    newcomer.frames, newcomer.strong_frames = 18, 0
+    beside = standing_at(simulation, 2, 3.0, 0.0, 0.3)
+    told = ToldVote({(1, "x"): misfit, (2, "x"): 0.9})
+    cast.admit([newcomer, beside], 300_000_000, told)
+    assert dict(cast.followed()) == ({"x": newcomer} if misfit < FITS else {})
+
+
+def test_who_was_out_of_sight_is_heard_anew():
+    landmarks, bones = landmark_set_named("body25"), IMUS_6
+    vote = SensorVote(landmarks, {"anna": bones})
+    from fusecap.associate.sensor_vote import _at_rest
+
+    standing = _at_rest(landmarks)
+    track = Track(0, standing, standing[0], np.zeros(1), 0)
+    reading = ImuReading(
+        bone_rotation_in_world=np.tile(np.eye(3), (len(bones), 1, 1)),
+        accel_in_world_m_s2=np.zeros((len(bones), 3)),
+    )
+    unseen, lying = np.full_like(standing, np.nan), standing[:, [1, 0, 2]]
+    for seen, seconds in ((lying, 1.0), (unseen, 0.3), (standing, 0.5)):
+        for _ in range(round(seconds * 60)):
+            vote.hear([track], seen[None], {"anna": reading}, 1 / 60)
+    assert vote.misfit(track, "anna", 0.25) < 0.05

@@ -7,7 +7,7 @@ import numpy as np
 from fusecap.associate.matching import cheapest
 from fusecap.associate.options import TrackerOptions
 from fusecap.associate.track import Track, absorb
-from fusecap.associate.views import Views
+from fusecap.associate.views import MIN_COMMON, Views
 from fusecap.geometry.camera import Camera, Rig
 
 _HIP_HEIGHT_M = 0.9
@@ -41,19 +41,33 @@ def find_again(
     options: TrackerOptions,
     now_ns: int,
 ) -> None:
-    """The one camera that is left sees unseen subjects (by row) again, near where expected.
+    """Single cameras see unseen subjects (by row) again, near where expected and posed as expected.
 
     At the depth they had, and nearer than they can have gone; who is who then is a guess.
     """
-    rows = list(unseen)
-    away_s = [(now_ns - track.seen_ns) * 1e-9 for track in unseen.values()]
-    reach = options.reach_m + options.reach_speed_m_s * np.array(away_s)
-    distance = views.distances(expected[rows], 2 * float(reach.max()), free)
-    for row, n in cheapest(np.where(distance < reach[:, None], distance, np.inf)):
-        t, camera = rows[row], int(views.camera_of[n])
+    rows, people = list(unseen), np.flatnonzero(free)
+    cost = np.full((len(rows), len(people)), np.inf)
+    moved = np.zeros((*cost.shape, 3))
+    for row, t in enumerate(rows):
+        away_s = (now_ns - unseen[t].seen_ns) * 1e-9
+        reach_m = options.reach_m + options.reach_speed_m_s * away_s
+        for column, n in enumerate(people):
+            camera = rig.cameras[views.camera_of[n]]
+            seen = _at_depth(camera, views.rays[n], expected[t]) - expected[t]
+            known = np.isfinite(seen[:, 0])
+            if known.sum() < MIN_COMMON:
+                continue
+            moved[row, column] = np.median(seen[known], axis=0)
+            away_m = float(np.linalg.norm(moved[row, column]))
+            other_m = np.linalg.norm(seen[known] - moved[row, column], axis=1).mean()
+            if away_m < reach_m and other_m < options.candidates.consistency_m:
+                cost[row, column] = away_m + other_m
+    for row, column in cheapest(cost):
+        t, n = rows[row], int(people[column])
+        camera = int(views.camera_of[n])
         seen = _at_depth(rig.cameras[camera], views.rays[n], expected[t])
-        moved = np.nanmedian(seen - expected[t], axis=0)
-        unseen[t].settle(np.where(np.isnan(seen), unseen[t].landmarks + moved, seen), now_ns)
+        elsewhere = unseen[t].landmarks + moved[row, column]
+        unseen[t].settle(np.where(np.isnan(seen), elsewhere, seen), now_ns)
         person[t, camera] = n
         free[n] = False
 

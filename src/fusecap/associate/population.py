@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from fusecap.associate.anatomy import Anatomy, size_misfit
@@ -16,18 +18,23 @@ from fusecap.kernels import association as kernels
 class Population:
     """Everybody who is tracked, in order of birth."""
 
-    def __init__(self, options: TrackerOptions, anatomy: Anatomy, mirror: np.ndarray) -> None:
+    def __init__(
+        self,
+        options: TrackerOptions,
+        anatomy: Anatomy,
+        mirror: np.ndarray,
+        ids: Iterator[int],
+    ) -> None:
         self.tracks: list[Track] = []
         self._options = options
         self._anatomy = anatomy
         self._mirror = mirror
-        self._next_id = 0
+        self._ids = ids
 
     def begin(self, landmarks: np.ndarray, now_ns: int) -> Track:
         """A new track, tentative until it is established."""
         centre_m, limbs_m = self._anatomy.centre(landmarks), self._anatomy.limb_lengths(landmarks)
-        track = Track(self._next_id, landmarks, centre_m, limbs_m, now_ns)
-        self._next_id += 1
+        track = Track(next(self._ids), landmarks, centre_m, limbs_m, now_ns)
         self.tracks.append(track)
         return track
 

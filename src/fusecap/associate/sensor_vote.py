@@ -69,6 +69,8 @@ class SensorVote:
         """Who says something at this instant."""
         self._mean: dict[Track, dict[str, tuple[float, float]]] = {}
         """Per track and wearer: the mean, and for how many seconds it was heard."""
+        self._silent_s: dict[Track, float] = {}
+        """Since each track was measured last."""
 
     @property
     def of_anybody(self) -> bool:
@@ -82,8 +84,20 @@ class SensorVote:
         readings: Mapping[str, ImuReading],
         elapsed_s: float,
     ) -> None:
-        """One instant more; `landmarks` are NaN where not measured now."""
-        self._mean = {track: self._mean.get(track, {}) for track in tracks}
+        """One instant more; `landmarks` are NaN where not measured now.
+
+        Whoever was not measured for a moment may be somebody else since, and is heard anew.
+        """
+        away_s = self._silent_s
+        known = [track for track in tracks if away_s.get(track, 0.0) < SOON_S]
+        self._mean = {
+            track: self._mean.get(track, {}) if track in known else {} for track in tracks
+        }
+        measured = np.isfinite(landmarks[:, :, 0]).sum(axis=1)
+        self._silent_s = {
+            track: 0.0 if count else away_s.get(track, 0.0) + elapsed_s
+            for track, count in zip(tracks, measured, strict=True)
+        }
         heard = set()
         for name in self._rows:
             if name not in readings:

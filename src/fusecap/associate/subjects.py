@@ -7,17 +7,18 @@ lost; a newcomer may be who is missing, and then continues under that name and t
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from fusecap.associate.anatomy import Anatomy, size_misfit
-from fusecap.associate.looks import SAME, WAIT_S, by_looks, differences, exchange, exchanged
+from fusecap.associate.looks import CLOTHES, SAME, WAIT_S, by_looks, differences
 from fusecap.associate.matching import cheapest
 from fusecap.associate.options import TrackerOptions
 from fusecap.associate.sensor_vote import FITS, MARGIN, SOON_S, SURE_S, SensorVote
 from fusecap.associate.track import Track
+from fusecap.associate.traits import Kind, exchange, exchanged
 from fusecap.errors import SessionError
 from fusecap.geometry.camera import Rig
 
@@ -63,9 +64,16 @@ class Cast:
     """All places of a session, and who may take one."""
 
     def __init__(
-        self, subjects: Sequence[Subject], rig: Rig, anatomy: Anatomy, options: TrackerOptions
+        self,
+        subjects: Sequence[Subject],
+        rig: Rig,
+        anatomy: Anatomy,
+        options: TrackerOptions,
+        ids: Iterator[int],
     ) -> None:
+        """`ids` has numbers that no track bears."""
         check_distinct(subjects)
+        self._ids = ids
         self._rig = rig
         self._anatomy = anatomy
         self._options = options
@@ -151,58 +159,84 @@ class Cast:
             or (place.track and (now_ns - place.track.seen_ns) * 1e-9 <= o.memory_s)
         ]
 
-    def pair_anew(self, tracks: Sequence[Track], vote: SensorVote) -> dict[int, int]:
+    def pair_anew(self, tracks: Sequence[Track], vote: SensorVote, now_ns: int) -> dict[int, int]:
         """Give wearers the tracks that their sensors fit, where these are clearly others.
 
-        Everyone who is tracked may be who wears them. The identity stays with the place, so who is
+        Everyone who is tracked may be who wears them, and a wearer may be nobody of these: the
+        place then waits, as one whom nobody fits does. The identity stays with the place, so who is
         followed under it must be solved anew. Returns, by the id that a track had, the one it has.
         """
-        places = [p for p in self._places if p.live and p.track and p.name in vote.heard]
-        if not places:
+        worn = [p for p in self._places if p.name in vote.heard]
+        cost = np.array([[vote.misfit(t, p.name, SURE_S) for t in tracks] for p in worn])
+        now = [tracks.index(p.track) if p.live and p.track in tracks else -1 for p in worn]
+        told = [row for row, t in enumerate(now) if t < 0 or np.isfinite(cost[row, t])]
+        if not told or not tracks:
             return {}
-        cost = np.array([[vote.misfit(t, p.name, SURE_S) for t in tracks] for p in places])
-        now = [tracks.index(p.track) for p in places if p.track in tracks]
-        if len(now) < len(places) or not np.isfinite(cost[range(len(places)), now]).all():
-            return {}
-        best = dict(cheapest(np.where(cost < FITS, cost, np.inf)))
-        moves = {row: column for row, column in best.items() if column != now[row]}
-        gain = sum(cost[row, now[row]] - cost[row, column] for row, column in moves.items())
+        unknown = [t for row, t in enumerate(now) if row not in told]
+        cost[:, unknown] = np.inf
+        strangers = [t not in [track for _, track in self.followed()] for t in tracks]
+        cost[np.ix_([t < 0 for t in now], strangers)] = np.inf  # They are for `admit`.
+        nobody = np.full((len(told), len(told)), FITS)
+        choice = np.concatenate([np.where(cost < FITS, cost, np.inf)[told], nobody], axis=1)
+        best = {told[r]: c if c < len(tracks) else -1 for r, c in cheapest(choice)}
+        moves = {row: t for row, t in best.items() if t != now[row]}
+        moves = {row: t for row, t in moves.items() if t >= 0 or now[row] in moves.values()}
+        gain = sum(
+            (cost[row, now[row]] if now[row] >= 0 else FITS) - (cost[row, t] if t >= 0 else FITS)
+            for row, t in moves.items()
+        )
         if not moves or gain < MARGIN * len(moves):
             return {}
-        return self._give({places[row].name: tracks[column] for row, column in moves.items()})
+        given = {worn[row].name: tracks[t] for row, t in moves.items() if t >= 0}
+        left = [worn[row] for row, t in moves.items() if t < 0]
+        return self._give(given, left, now_ns)
 
-    def part_by_looks(
-        self, tracks: Sequence[Track], now_ns: int, vote: SensorVote
+    def part_by(
+        self, kind: Kind, tracks: Sequence[Track], now_ns: int, vote: SensorVote
     ) -> tuple[dict[int, int], int]:
-        """Put right who came out of an overlap exchanged, as clothes show; wearers are not asked.
+        """Put right who came out of an overlap exchanged, as a trait shows; wearers are not asked.
 
         Returns what `pair_anew` does, and since when it has been so [ns].
         """
         worn = [p.track for p in self._places if p.live and p.name in vote.heard]
-        moves = exchanged([t for t in tracks if t.seen_ns == now_ns and t not in worn], now_ns)
+        seen = [t for t in tracks if t.seen_ns == now_ns and t not in worn]
+        moves = exchanged(kind, seen, now_ns)
         if not moves:
             return {}, now_ns
-        since_ns = min(t.looks.alone_ns for t in moves if t.looks)
+        since_ns = min(t.traits[kind.name].alone_ns for t in moves)
         body_of = {person: body for body, person in moves.items()}
         exchange(moves)
         places = [p for p in self._places if p.live and p.track in body_of]
-        return self._give({p.name: body_of[p.track] for p in places if p.track}), since_ns
+        given = {p.name: body_of[p.track] for p in places if p.track}
+        return self._give(given, (), now_ns), since_ns
 
-    def _give(self, given: dict[str, Track]) -> dict[int, int]:
-        """Give live places other tracks; by the id that a track had, the one it has then."""
+    def _give(self, given: dict[str, Track], left: Sequence[Place], now_ns: int) -> dict[int, int]:
+        """Give places other tracks; by the id that a track had, the one it has then.
+
+        The places `left` keep their identity and wait for whom it is; of others that lose a track,
+        each gets one that was given up.
+        """
         followed = {p.name: p.track for p in self._places if p.live and p.track}
-        freed = [followed[name] for name in given if followed[name] not in given.values()]
-        robbed = [n for n, t in followed.items() if n not in given and t in given.values()]
-        given.update({name: freed.pop() for name in robbed})
-        spare = [track for track in given.values() if track not in followed.values()]
-        renumbered = {track.track_id: followed[name].track_id for name, track in given.items()}
-        renumbered.update(
-            {was.track_id: new.track_id for was, new in zip(freed, spare, strict=True)}
-        )
+        number = {p.name: p.track.track_id for p in self._places if p.track}
+        alone = {p.name for p in left}
+        taken = list(given.values())
+        freed = [t for name, t in followed.items() if name in given and t not in taken]
+        robbed = [n for n, t in followed.items() if n not in given and t in taken]
+        given.update({n: freed.pop() for n in robbed if n not in alone})
+        spare = [track.track_id for track in taken if track not in followed.values()]
+        spare += [next(self._ids) for _ in freed[len(spare) :]]
+        number.update({n: next(self._ids) for n in given if n not in number})
+        renumbered = {t.track_id: number[n] for n, t in given.items()}
+        renumbered.update({t.track_id: i for t, i in zip(freed, spare, strict=False)})
+        for place in left:
+            assert place.track is not None
+            place.track, place.live = place.track.unknown(now_ns), False
         for place in self._places:
-            place.track = given.get(place.name, place.track)
+            if place.name in given:
+                place.track, place.live = given[place.name], True
         for track in (*given.values(), *freed):
             track.track_id = renumbered[track.track_id]
+            track.was_mistaken()
         return renumbered
 
     def return_to_way(
@@ -265,10 +299,13 @@ class Cast:
         for place in self._places:
             if place.name in vote.heard and (now_ns - self._begun_ns) * 1e-9 > o.patience_s:
                 place.start_m = None
-        newcomers = [t for t in tracks if t.track_id not in subjects and self._may_enter(t, now_ns)]
         self.kept_out, self.undecided, self.returned = [], [], {}
-        gone = [p for p in self._places if p.name in vote.heard and self._is_away(p, now_ns)]
-        newcomers, _, early = self._admit_wearers(newcomers, gone, tracks, now_ns, vote)
+        strangers = [t for t in tracks if t.track_id not in subjects and self._is_there(t, now_ns)]
+        away = [p for p in self._places if p.name in vote.heard and self._is_away(p, now_ns)]
+        named = self._admit_wearers(strangers, away, tracks, vote)
+        newcomers = [t for t in strangers if t.is_established(o) and t not in named]
+        gone = [p for p in away if p.track and p.track not in named]
+        early = self._early(newcomers, gone, tracks, now_ns)
         if early:
             others = [t for t in early if all(self._away(t, p, vote) >= FITS for p in gone)]
             newcomers = [t for t in newcomers if t not in early or t in others]
@@ -289,13 +326,19 @@ class Cast:
         )
         cost = np.where(by_looks(away), cost.reshape(len(newcomers), len(known)), np.inf)
         cost[np.ix_([t in early for t in newcomers], [p in gone for p in known])] = np.inf
+        for n, k in np.argwhere(np.isfinite(cost)).tolist():
+            if known[k].track is None and self._contradicts(newcomers[n], known[k], vote, now_ns):
+                cost[n, k] = np.inf
         open_s = [o.doubt_s if p.live else 0.0 for p in known]
         silent_s = [(now_ns - p.track.triangulated_ns) * 1e-9 if p.track else 0.0 for p in known]
         undecided = np.tile(np.array(silent_s) < np.array(open_s), (len(newcomers), 1))
         if (now_ns - self._begun_ns) * 1e-9 < o.two_view_birth_s:
             # Who begins there may be found later than who stands beside.
             begin = np.array([p.track is None for p in known], dtype=bool)
+            at_start = (begin & (cost <= _BESIDE_M)).any(axis=1, keepdims=True)
             beside = begin & np.isfinite(cost) & (cost > _BESIDE_M)
+            cost = np.where(beside & at_start, np.inf, cost)
+            beside &= ~at_start
             self.undecided += [newcomers[n] for n in np.flatnonzero(beside.any(axis=1))]
             undecided |= beside
         settled = ~(np.isfinite(cost) & undecided).any(axis=1)
@@ -307,7 +350,8 @@ class Cast:
         rest = [t for n, t in enumerate(newcomers) if n not in dict(admitted)]
         rest.sort(key=lambda t: (-t.frames, self._from_middle(t)))
         waiting = [p for p in self._places if not (p.live or p.track or p.start_m)]
-        rest, waiting, early = self._admit_wearers(rest, waiting, tracks, now_ns, vote)
+        worn = [p for p in waiting if p.name in vote.heard]
+        early = self._early(rest, worn, tracks, now_ns)
         rest = [track for track in rest if track not in early]
         chosen = rest[: len(waiting) + max(self._room(), 0)]
         if any(p.track and not p.live for p in self._places):
@@ -320,41 +364,55 @@ class Cast:
 
     def _admit_wearers(
         self,
-        newcomers: list[Track],
-        waiting: list[Place],
+        strangers: Sequence[Track],
+        worn: Sequence[Place],
         tracks: Sequence[Track],
-        now_ns: int,
         vote: SensorVote,
-    ) -> tuple[list[Track], list[Place], list[Track]]:
-        """Places of whoever wears sensors go to whom they fit; who else may be admitted, and where.
+    ) -> list[Track]:
+        """Give places of whoever wears sensors to whom these fit by a margin; returns whom.
 
-        The last are those who are too early for a wearer's place: where there are several, others
-        wait a while, then are admitted like everybody; who was mistaken is paired anew later.
+        That says more than how many views saw somebody: nobody need be established for it.
         """
-        worn = [p for p in waiting if p.name in vote.heard]
-        if not worn or not newcomers:
-            return newcomers, waiting, []
-        cost = np.array([[self._away(t, p, vote) for p in worn] for t in newcomers])
-        named = set()
+        if not worn or not strangers:
+            return []
+        cost = np.array([[self._away(t, p, vote) for p in worn] for t in strangers])
+        named = []
         for n, w in cheapest(np.where(cost < FITS, cost, np.inf)):
             others = np.concatenate([np.delete(cost[n], w), np.delete(cost[:, w], n)])
             if not (others < cost[n, w] + MARGIN).any():
-                self._admit_to(worn[w], newcomers[n], tracks)
-                named.add(n)
-        waiting = [p for p in waiting if not p.live]
-        undisputed = len(tracks) == len(worn) == 1 or all(p.live for p in worn)
-        left = [t for n, t in enumerate(newcomers) if n not in named]
-        wait_ns = 0.0 if undisputed else self._options.patience_s * 1e9
-        return left, waiting, [t for t in left if now_ns - t.born_ns < wait_ns]
+                self._admit_to(worn[w], strangers[n], tracks)
+                named.append(strangers[n])
+        return named
 
-    @staticmethod
-    def _away(track: Track, place: Place, vote: SensorVote) -> float:
+    def _early(
+        self,
+        newcomers: Sequence[Track],
+        worn: Sequence[Place],
+        tracks: Sequence[Track],
+        now_ns: int,
+    ) -> list[Track]:
+        """Who is too young for these wearers' places, as sensors may still tell who it is.
+
+        Later they are admitted like everybody; who was mistaken is paired anew.
+        """
+        if not worn or len(tracks) == len(worn) == 1:
+            return []
+        return [t for t in newcomers if now_ns - t.born_ns < self._options.patience_s * 1e9]
+
+    def _contradicts(self, track: Track, place: Place, vote: SensorVote, now_ns: int) -> bool:
+        """Whether sensors say that a young newcomer is not who begins at this place."""
+        young = now_ns - track.born_ns < self._options.patience_s * 1e9
+        return young and vote.misfit(track, place.name, SOON_S) >= FITS
+
+    def _away(self, track: Track, place: Place, vote: SensorVote) -> float:
         """How badly a newcomer fits a wearer's sensors; infinite: is known to be somebody else.
 
         Whom the sensors did not fit either, who was followed there, is no evidence.
         """
         was = place.track if place.misfit_since_ns is None else None
         if was is not None and track.is_other_than(was):
+            return np.inf
+        if place.track is None and self._from_start_m(track, place) > _BESIDE_M:
             return np.inf
         return vote.misfit(track, place.name, SOON_S)
 
@@ -370,26 +428,28 @@ class Cast:
             k
             for k, p in enumerate(places)
             if p.track is not None
-            and p.track.looks is not None
+            and CLOTHES.name in p.track.traits
             and p.name not in vote.heard
             and (now_ns - p.track.seen_ns) * 1e-9 <= self._options.memory_s
         ]
-        shown = [n for n, t in enumerate(newcomers) if t.looks is not None]
-        looks = [p.track.looks for k, p in enumerate(places) if k in told and p.track]
+        shown = [n for n, t in enumerate(newcomers) if CLOTHES.name in t.traits]
+        looks = [
+            p.track.traits[CLOTHES.name] for k, p in enumerate(places) if k in told and p.track
+        ]
         away[np.ix_(shown, told)] = differences(
-            [t.looks for t in newcomers if t.looks], [some for some in looks if some]
+            [newcomers[n].traits[CLOTHES.name] for n in shown], looks
         )
         return away
 
     def _hidden(self, track: Track, away: np.ndarray, places: Sequence[Place], now_ns: int) -> bool:
         """Whether clothes may soon tell if a newcomer is somebody who is missing."""
-        if track.looks is None or (now_ns - track.born_ns) * 1e-9 >= WAIT_S:
+        if CLOTHES.name not in track.traits or (now_ns - track.born_ns) * 1e-9 >= WAIT_S:
             return False
         told = [
             not p.live
             and p.track is not None
-            and p.track.looks is not None
-            and p.track.looks.is_known
+            and CLOTHES.name in p.track.traits
+            and p.track.traits[CLOTHES.name].is_known
             for p in places
         ]
         return bool((np.isnan(away) & np.array(told, dtype=bool)).any())
@@ -400,13 +460,8 @@ class Cast:
         Of who is dressed `alike` size says less.
         """
         o = self._options
-        centre = self._anatomy.centre(track.landmarks)
         if place.track is None:
-            assert place.start_m is not None
-            first_m = np.where(np.isfinite(track.born_m), track.born_m, centre)
-            away = float(np.hypot(first_m[0] - place.start_m[0], first_m[2] - place.start_m[1]))
-            if self._single:
-                return 0.0  # One camera gives no place to compare with.
+            away = self._from_start_m(track, place)
             return away if away < o.start_radius_m else np.inf
         lost = place.track
         doubtful = lost.triangulated_ns < track.born_ns
@@ -424,11 +479,19 @@ class Cast:
             return np.inf
         return float(away / reach + misfit / o.size_tolerance)
 
+    def _from_start_m(self, track: Track, place: Place) -> float:
+        """How far from where a subject begins a newcomer was first seen; 0 where nobody knows."""
+        if place.start_m is None or self._single:
+            return 0.0  # One camera gives no place to compare with.
+        centre = self._anatomy.centre(track.landmarks)
+        first_m = np.where(np.isfinite(track.born_m), track.born_m, centre)
+        return float(np.hypot(first_m[0] - place.start_m[0], first_m[2] - place.start_m[1]))
+
     @staticmethod
     def _is_away(place: Place, now_ns: int) -> bool:
-        """Whether a subject is missing, or will be unless somebody sees it again."""
+        """Whether a subject is not there, or will not be unless somebody sees it again."""
         track = place.track
-        return track is not None and (not place.live or now_ns - track.seen_ns > SOON_S * 1e9)
+        return track is None or not place.live or now_ns - track.seen_ns > SOON_S * 1e9
 
     def _admit_to(self, place: Place, track: Track, everyone: Sequence[Track]) -> None:
         """A place that was live is handed over: nobody follows there whom it had any more."""
@@ -439,19 +502,18 @@ class Cast:
             if place.live:
                 place.track.replaced = True
             track.becomes(place.track, everyone)
-            if track.looks is not None and place.track.looks is not None:
-                track.looks.continues(place.track.looks)
+            for name in track.traits.keys() & place.track.traits.keys():
+                track.traits[name].continues(place.track.traits[name])
         place.track = track
         place.live = True
 
+    def _is_there(self, track: Track, now_ns: int) -> bool:
+        """Whether somebody is seen now, within the volume, who was not said to be no subject."""
+        return not track.dismissed and track.seen_ns == now_ns and self.inside(track)
+
     def _may_enter(self, track: Track, now_ns: int) -> bool:
         """Whether somebody is there now who may become a subject."""
-        return (
-            not track.dismissed
-            and track.seen_ns == now_ns
-            and track.is_established(self._options)
-            and self.inside(track)
-        )
+        return self._is_there(track, now_ns) and track.is_established(self._options)
 
     def inside(self, track: Track) -> bool:
         """Whether the torso is over the capture volume; an unknown place is."""

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fusecap.associate.clothes import Looks
 from fusecap.associate.options import TrackerOptions
+from fusecap.associate.traits import Trait
 from fusecap.kernels import association as kernels
 
 POSITION_GAIN = 0.8
@@ -54,7 +54,6 @@ class Track:
         "landmarks",
         "limb_count",
         "limb_sum_m",
-        "looks",
         "missed_ns",
         "overlap_since_ns",
         "replaced",
@@ -63,6 +62,7 @@ class Track:
         "time_ns",
         "told",
         "track_id",
+        "traits",
         "triangulated_ns",
         "velocity",
         "views",
@@ -97,8 +97,8 @@ class Track:
         """For how long two cameras or more have looked and no two seen it."""
         self.beside: dict[Track, float] = {}
         """Instants in which it and another were measured apart; of few views each counts less."""
-        self.looks: Looks | None = None
-        """How the clothes look, where pictures tell."""
+        self.traits: dict[str, Trait] = {}
+        """By kind, what tells this person from others."""
         self.told = False
         """Whether a user knows that this person is left out."""
         self.replaced = False
@@ -185,6 +185,19 @@ class Track:
         newcomer.limb_count += self.limb_count
         self.limb_sum_m, self.limb_count = self.limb_sum_m * 0.0, self.limb_count * 0.0
         self.fork = newcomer.fork = None
+        self.was_mistaken()
+
+    def was_mistaken(self) -> None:
+        """It followed several people: whom it was measured beside says nothing."""
+        for other in self.beside:
+            other.beside.pop(self, None)
+        self.beside = {}
+
+    def unknown(self, now_ns: int) -> Track:
+        """The identity alone, of somebody who turned out not to be whom this followed."""
+        nowhere = np.full(self.landmarks.shape, np.nan)
+        sizes = np.full(self.limb_sum_m.shape, np.nan)
+        return Track(self.track_id, nowhere, np.full(3, np.nan), sizes, now_ns)
 
     def is_established(self, options: TrackerOptions) -> bool:
         """Whether enough views saw it for long enough to be a person."""

@@ -22,14 +22,15 @@ Worked number: two people pass at 0.4 m with 1.5 m/s each at 30 Hz. Constant vel
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
 
+from fusecap.associate import looks, sizes
 from fusecap.associate.anatomy import Anatomy
 from fusecap.associate.candidates import find_candidates
-from fusecap.associate.looks import DECIDE_NS, learn
 from fusecap.associate.matching import Matcher
 from fusecap.associate.one_view import find_again, follow, nearest_in_view
 from fusecap.associate.options import TrackerOptions
@@ -37,6 +38,7 @@ from fusecap.associate.population import Population
 from fusecap.associate.sensor_vote import SensorVote
 from fusecap.associate.subjects import Cast, Subject
 from fusecap.associate.track import Track, absorb, measure, median_apart_m, part
+from fusecap.associate.traits import DECIDE_NS, doubt
 from fusecap.associate.views import MIN_COMMON, Views
 from fusecap.believable import believable_detections, believable_points, checked_moment
 from fusecap.body.landmarks import LandmarkSet
@@ -58,8 +60,9 @@ class Tracker:
         self._options = options or TrackerOptions()
         self._anatomy = Anatomy(landmark_set)
         self._landmarks = len(landmark_set.landmark_names)
-        self._cast = Cast(subjects, rig, self._anatomy, self._options)
-        self._population = Population(self._options, self._anatomy, landmark_set.mirror)
+        ids = itertools.count()
+        self._cast = Cast(subjects, rig, self._anatomy, self._options, ids)
+        self._population = Population(self._options, self._anatomy, landmark_set.mirror, ids)
         self._matcher = Matcher(self._options, landmark_set.mirror)
         self._single = len(rig) == 1
         self._limits_px = np.array([camera.size_px for camera in rig.cameras]).reshape(-1, 2)
@@ -110,17 +113,20 @@ class Tracker:
         self._absorb(person, measured, expected, now_ns)
         if not self._single and free.any():
             person, measured = self._find(views, person, measured, free, now_ns)
-            if self._looking.sum() == 1:
-                subjects = self._cast.ids()
-                unseen = {
-                    t: track
-                    for t, track in enumerate(tracks)
-                    if track.track_id in subjects and (person[t] < 0).all()
-                }
-                if unseen:
-                    find_again(
-                        self._rig, views, unseen, person, expected, free, self._options, now_ns
-                    )
+            # Somebody's sensors say how they are posed; else only who is left for the last camera.
+            alone = self._looking.sum() == 1
+            subjects = {
+                track.track_id
+                for name, track in self._cast.followed()
+                if alone or name in self._vote.heard
+            }
+            unseen = {
+                t: track
+                for t, track in enumerate(tracks)
+                if track.track_id in subjects and (person[t] < 0).all()
+            }
+            if unseen:
+                find_again(self._rig, views, unseen, person, expected, free, self._options, now_ns)
         follow(self._rig, views, tracks, person, expected, now_ns)
         if self._single:
             person, measured = self._find_single(views, person, measured, expected, now_ns)
@@ -134,21 +140,24 @@ class Tracker:
         self._vote.hear(
             [tracks[row] for row in rows], measured[rows], self._readings, elapsed_ns * 1e-9
         )
-        if detections.appearance is not None:
-            self._look([tracks[row] for row in rows], views.local(person)[rows], detections)
+        if not self._single:
+            self._learn(
+                [tracks[row] for row in rows], views, person[rows], measured[rows], detections
+            )
         self.renumbered, self.renumbered_since_ns = self._cast.return_to_way(
             everyone, self._vote, now_ns
         )
         self.notes = self._renumbered_notes("somebody was found where they were going")
         self._cast.admit(everyone, now_ns, self._vote)
         if not self.renumbered:
-            self.renumbered = self._cast.pair_anew(everyone, self._vote)
+            self.renumbered = self._cast.pair_anew(everyone, self._vote, now_ns)
             self.notes = self._renumbered_notes("sensors say so")
-        if not self.renumbered and detections.appearance is not None and self._turns(now_ns):
-            self.renumbered, self.renumbered_since_ns = self._cast.part_by_looks(
-                everyone, now_ns, self._vote
-            )
-            self.notes = self._renumbered_notes("clothes say so")
+        for kind in (looks.CLOTHES, sizes.SIZES):
+            if not self.renumbered and self._turns(now_ns):
+                self.renumbered, self.renumbered_since_ns = self._cast.part_by(
+                    kind, everyone, now_ns, self._vote
+                )
+                self.notes += self._renumbered_notes(f"their {kind.name} says so")
         self.notes += [
             f"{name}: sensors and cameras contradict each other; either nobody who is seen wears "
             "these sensors, or their bones or headings are not as stated (fusecap calibrate imu)"
@@ -258,11 +267,23 @@ class Tracker:
         hoped_m = centre(np.where(both, expected, np.nan))
         track.note_jump(hoped_m, centre(np.where(both, found, np.nan)), now_ns, o.gate_m, o.doubt_s)
 
-    def _look(self, tracks: list[Track], person: np.ndarray, detections: Detections) -> None:
-        """What pictures show of clothes; `person` (t, c) counts within each camera."""
-        if tracks and detections.appearance is not None:
-            centre_m = np.array([self._anatomy.centre(track.landmarks) for track in tracks])
-            learn(tracks, person, detections.appearance, centre_m, detections.timestamp_ns)
+    def _learn(
+        self,
+        tracks: list[Track],
+        views: Views,
+        person: np.ndarray,
+        measured: np.ndarray,
+        detections: Detections,
+    ) -> None:
+        """What tells people from each other; `person` (t, c) are rows of all views' people."""
+        if not tracks:
+            return
+        now_ns = detections.timestamp_ns
+        doubt(tracks, np.array([self._anatomy.centre(track.landmarks) for track in tracks]), now_ns)
+        limbs, count = self._anatomy.limb_lengths(measured), (person >= 0).sum(axis=1)
+        sizes.learn(tracks, limbs, count, self._options.birth_views, now_ns)
+        if detections.appearance is not None:
+            looks.learn(tracks, views.local(person), detections.appearance, now_ns)
 
     def _turns(self, now_ns: int) -> bool:
         """Whether a new stretch of time begins in which clothes are compared."""

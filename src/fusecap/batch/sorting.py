@@ -142,7 +142,7 @@ def _sensors_began(
     """When they began to be others, of whom sensors said so at an instant.
 
     That is when the new ids, until then, fit the sensors better by most. `wearers` has names by
-    the new ids. Of whoever had no track then it counts whether the other one fits.
+    the new ids. Of two of whom one had no track then it counts whether the other one fits.
     """
     gain = most = 0.0
     since = instant
@@ -152,14 +152,23 @@ def _sensors_began(
             break
         for former, number in renumbered.items():
             name = wearers.get(number, "")
-            if name in readings and number in points:
-                both = np.stack([points[number], points.get(former, points[number])])
-                away = vote.away(both, name, readings[name])
-                if away is not None and np.isfinite(away).all():
-                    gain += float(away[0] - (away[1] if former in points else FITS))
+            if name in readings:
+                first = _unlike(vote, points.get(number), name, readings[name])
+                better = first - _unlike(vote, points.get(former), name, readings[name])
+                gain += better if np.isfinite(better) else 0.0
         if gain >= most:
             most, since = gain, row
     return since
+
+
+def _unlike(
+    vote: SensorVote, landmarks_m: np.ndarray | None, name: str, reading: ImuReading
+) -> float:
+    """How badly somebody's sensors fit a skeleton; nobody at all fits as one who just does not."""
+    if landmarks_m is None:
+        return FITS
+    away = vote.away(landmarks_m[None], name, reading)
+    return np.nan if away is None else float(away[0])
 
 
 def _drop_tails(assigned: Assignments, instants: Instants) -> None:
