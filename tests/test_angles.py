@@ -270,6 +270,9 @@ def test_gait_cycles_go_from_strike_to_strike():
     assert gait.mean_deg[:, knee].max() == pytest.approx(np.degrees(1.6), abs=1)
     assert gait.band_deg[:, knee].max() < 5
     assert len(gait_cycles(take, found, 0, "right").deg) == 0
+    lowered = take.bone_position_in_world_m - [0.0, 0.6, 0.0] * np.eye(21)[0][:, None]
+    lying = gait_cycles(replace(take, bone_position_in_world_m=lowered), found, 0, "left")
+    assert len(lying.deg) == 0 and "upright" in lying.why_none
     nobody = replace(take, tracked=np.zeros_like(take.tracked))
     none = gait_cycles(nobody, joint_angles(nobody), 0, "left")
     assert len(none.deg) == 0 and np.isnan(none.mean_deg).all() and np.isnan(none.band_deg).all()

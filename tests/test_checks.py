@@ -138,6 +138,27 @@ def test_who_lies_below_cameras_at_the_ceiling_lies_and_the_world_stands(facing_
     assert any("away from up" in str(finding) for finding in findings) is told
 
 
+@pytest.mark.parametrize("worn", [(), ("thigh", "shank")])
+def test_limbs_that_nothing_measures_are_told(tmp_path, worn):
+    path = write_session(tmp_path)
+    ends = [f"{side}_{end}" for end in ("knee", "ankle") for side in ("left", "right")]
+
+    def without_legs(points):
+        points[[BODY25.index(end) for end in ends]] = 0
+        return points
+
+    each_person(tmp_path, without_legs)
+    if worn:
+        tables = [
+            f'[[subject.imu]]\nbone = "{side}_{bone}"\nfile = "x.csv"\n'
+            for bone in worn
+            for side in ("left", "right")
+        ]
+        path.write_text(f'{path.read_text()}\n[[subject]]\nname = "a"\n{"".join(tables)}')
+    told = [text for text in said(path) if "leave their angles out" in text]
+    assert [", ".join(ends) in text for text in told] == ([] if worn else [True])
+
+
 def test_a_subject_who_was_never_found_is_told(tmp_path):
     path = write_session(tmp_path)
     edit(path, "[[camera]]", '[[subject]]\nname = "far"\nstart_m = [40.0, 40.0]\n\n[[camera]]')

@@ -154,8 +154,9 @@ def test_a_result_that_json_cannot_hold_is_a_failure(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="signals")
-def test_a_cell_that_kills_its_process_fails_alone(tmp_path):
-    cells = [Square(number=n, does="die" if n == 1 else "wait") for n in range(5)]
+@pytest.mark.parametrize("how", ["die", "end"])
+def test_a_cell_that_kills_its_process_fails_alone(tmp_path, how):
+    cells = [Square(number=n, does=how if n == 1 else "wait") for n in range(5)]
     outcomes = run_cells(cells, square, folder=tmp_path, workers=2)
     assert [o.error for o in outcomes] == ["", "its process was killed", "", "", ""]
 

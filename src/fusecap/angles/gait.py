@@ -15,6 +15,8 @@ from fusecap.take import Take
 PERCENT = np.linspace(0.0, 100.0, 101)
 _SHORTEST_S, _LONGEST_S = 0.5, 2.5
 _LEG = ("hip", "knee", "ankle")
+_UPRIGHT_M = 0.3
+"""Whose hips are not so far above the foot lies, kneels or crawls."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,7 +42,7 @@ class GaitCycles:
             return "it comes down once"
         return (
             f"it comes down {self.strikes} times, but no two strikes lie {_SHORTEST_S:g} to "
-            f"{_LONGEST_S:g} s apart with the person followed between them"
+            f"{_LONGEST_S:g} s apart with the person followed, and upright, between them"
         )
 
     @property
@@ -57,7 +59,7 @@ class GaitCycles:
 
 
 def gait_cycles(take: Take, angles: JointAngles, subject: int, side: str) -> GaitCycles:
-    """Cycles of 0.5 to 2.5 s of one leg in which the subject was tracked throughout."""
+    """Cycles of 0.5 to 2.5 s of one leg in which the subject was tracked and upright throughout."""
     columns = [
         column
         for column, name in enumerate(angles.names)
@@ -66,10 +68,12 @@ def gait_cycles(take: Take, angles: JointAngles, subject: int, side: str) -> Gai
     strikes = [
         event.frame for event in foot_events(take, subject) if event.strikes and event.side == side
     ]
+    height_m = take.bone_position_in_world_m[subject, :, :, 1]
+    upright = height_m[:, 0] - height_m[:, take.skeleton.bone(f"{side}_foot")] > _UPRIGHT_M
     starts, cycles = [], []
     for first, end in pairwise(strikes):
         time_s = angles.time_s[first : end + 1]
-        whole = take.tracked[subject, first : end + 1].all()
+        whole = (take.tracked[subject] & upright)[first : end + 1].all()
         if whole and _SHORTEST_S <= time_s[-1] - time_s[0] <= _LONGEST_S:
             at_s = np.interp(PERCENT, (0.0, 100.0), (time_s[0], time_s[-1]))
             curves = angles.deg[subject, first : end + 1, columns]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -10,14 +10,19 @@ from fusecap.body.landmarks import LANDMARK_SETS, LandmarkSet
 from fusecap.findings import Findings
 from fusecap.geometry.camera import Camera, Rig
 from fusecap.sources.keypoint_files import KeypointTrack
+from fusecap.sources.session import Session
 
 LOW_COVERAGE = 0.1
+_UNSEEN = 0.02
+_ENDS = {"elbow": "upper_arm", "wrist": "forearm", "knee": "thigh", "ankle": "shank"}
+"""Landmarks without which nothing tells of a bone, unless a sensor does."""
 
 
 def check_keypoints(
-    tracks: Mapping[str, KeypointTrack], rig: Rig | None, findings: Findings
+    session: Session, tracks: Mapping[str, KeypointTrack], rig: Rig | None, findings: Findings
 ) -> None:
-    """Of every camera that could be read."""
+    """Of every camera that could be read, and of all together."""
+    _check_limbs_seen(session, [*tracks.values()], findings)
     for name, track in tracks.items():
         _check_coverage(track, findings)
         _check_order(track, findings)
@@ -34,6 +39,34 @@ def _check_coverage(track: KeypointTrack, findings: Findings) -> None:
             f"camera '{track.name}'",
             f"sees people in {share:.1%} of its {spanned} frames",
             "check the detector's output of this camera, or leave the camera out",
+        )
+
+
+def _check_limbs_seen(
+    session: Session, tracks: Sequence[KeypointTrack], findings: Findings
+) -> None:
+    """Legs behind tables: what they do is the prior's guess."""
+    found = [_all_people(track)[:, :, :2] for track in tracks]
+    if not sum(map(len, found)):
+        return
+    worn = [{imu.bone for imu in subject.imus} for subject in session.subjects]
+    landmarks = tracks[0].landmarks
+    seen = np.isfinite(np.concatenate(found)).all(axis=2).mean(axis=0)
+    unseen = [
+        f"{side}_{end}"
+        for end, bone in _ENDS.items()
+        for side in ("left", "right")
+        if (index := landmarks.index(f"{side}_{end}")) is not None
+        and seen[index] < _UNSEEN
+        and not (worn and all(f"{side}_{bone}" in bones for bones in worn))
+    ]
+    if unseen:
+        findings.add(
+            "warning",
+            "cameras",
+            f"none sees {', '.join(unseen)} of anybody",
+            "what these limbs do is a guess, and its error bars are too narrow: leave their angles "
+            "out, or let cameras see them or sensors be worn there",
         )
 
 

@@ -52,7 +52,7 @@ def check_motion(
     findings: Findings,
 ) -> None:
     """What cameras and sensors say of people, whether from files or as a live run took it."""
-    check_keypoints({track.name: track for track in keypoints}, rig, findings)
+    check_keypoints(session, {track.name: track for track in keypoints}, rig, findings)
     check_imus(session, imus, findings)
     views = None if rig is None else ComparedViews.of(rig, keypoints)
     if views is not None:

@@ -149,6 +149,9 @@ def _timed(work: Work, cell: Any) -> tuple[dict[str, Any] | None, str, float]:
     try:
         result, error = work(cell), ""
         json.dumps(result, allow_nan=False)
+    except SystemExit:
+        # A pool would send it back as an answer, and wait for the next cell.
+        os._exit(1)
     except Exception as failure:
         result, error = None, f"{type(failure).__name__}: {failure}"
     return result, error, time.perf_counter() - started
@@ -222,7 +225,7 @@ def _quit_with_parent() -> None:
     One that is told to end leaves no unfinished file.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
+    signal.signal(signal.SIGTERM, _end)
     parent = multiprocessing.parent_process()
 
     def quit() -> None:
@@ -231,6 +234,15 @@ def _quit_with_parent() -> None:
             os._exit(1)
 
     threading.Thread(target=quit, daemon=True).start()
+
+
+def _end(*_: object) -> None:
+    """Once; between two cells the pool may take the exit for an answer, hence the timer."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    timer = threading.Timer(1.0, os._exit, (1,))
+    timer.daemon = True
+    timer.start()
+    sys.exit(1)
 
 
 def _cores() -> int:
