@@ -9,6 +9,7 @@ wants to become.
 
 from __future__ import annotations
 
+import codecs
 import io
 import itertools
 import json
@@ -167,6 +168,22 @@ def read_text(path: Path | str, kind: InputKind, *, strict: bool = True) -> str:
         return read_bytes(path, kind).decode("utf-8-sig", "strict" if strict else "replace")
     except UnicodeDecodeError as error:
         raise kind.error(f"{path}: cannot be read as UTF-8 text: {error}") from None
+
+
+def read_lines(path: Path | str, kind: InputKind) -> Iterator[str]:
+    """Those of a text in UTF-8 or UTF-16, one at a time; raises `kind.error`.
+
+    Bytes that are no text become question marks.
+    """
+    with open_input(path, kind) as file:
+        try:
+            wide = file.peek(2)[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+            encoding = "utf-16" if wide else "utf-8-sig"
+            with io.TextIOWrapper(file, encoding=encoding, errors="replace") as text:
+                for line in text:
+                    yield line.removesuffix("\n")
+        except OSError as error:
+            raise kind.error(f"{path}: cannot be read: {_reason(error)}") from None
 
 
 def read_toml(path: Path | str, kind: InputKind) -> dict[str, Any]:

@@ -173,7 +173,7 @@ def _numbered_files(folder: Path) -> dict[int, str]:
             f"{folder}: no keypoint files; expected one .json per frame whose name ends in the "
             "frame's number"
         )
-    return dict(sorted(by_frame.items()))
+    return {number: by_frame[number] for number in sorted(by_frame)}
 
 
 def read_people(path: Path, landmarks: LandmarkSet) -> np.ndarray | None:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import codecs
 import csv
-import itertools
 from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from fusecap.errors import InputError, nearest
-from fusecap.inputs import SENSORS, read_bytes
+from fusecap.inputs import SENSORS, read_lines
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,14 +49,6 @@ class ImuTable:
         return None, (f"no accelerations were read: {listed} are not {', '.join(names)}",)
 
 
-def read_lines(path: Path) -> list[str]:
-    """The lines of a text file in UTF-8 or UTF-16; raises `InputError`."""
-    content = read_bytes(path, SENSORS)
-    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        return content.decode("utf-16", "replace").splitlines()
-    return content.decode("utf-8-sig", "replace").splitlines()
-
-
 def read_table(path: Path, *first_columns: str) -> ImuTable:
     """The table whose header line starts with one of `first_columns`.
 
@@ -67,19 +57,23 @@ def read_table(path: Path, *first_columns: str) -> ImuTable:
     `InputError` when there is no such header, no row under it, or when commas between cells and
     commas in numbers cannot be told apart.
     """
-    lines = read_lines(path)
+    lines = read_lines(path, SENSORS)
     starts = tuple(first_columns)
-    headers = (i for i, line in enumerate(lines) if line.lstrip(' \t"').startswith(starts))
-    index = next(headers, None)
-    if index is None:
+    preamble: list[str] = []
+    header = ""
+    for header in lines:
+        if header.lstrip(' \t"').startswith(starts):
+            break
+        preamble.append(header)
+    else:
         raise InputError(
             f"{path}: no header line that starts with '{starts[0]}'; "
             "check that the file is of the stated format"
         )
-    delimiter = max("\t,;", key=lines[index].count)
-    (head,) = csv.reader(lines[index : index + 1], delimiter=delimiter)
+    delimiter = max("\t,;", key=header.count)
+    (head,) = csv.reader([header], delimiter=delimiter)
     columns = tuple(cell.strip() for cell in head)
-    body = (line for line in itertools.islice(lines, index + 1, None) if line.strip())
+    body = (line for line in lines if line.strip())
     values, units = array("d"), ()
     count, doubled, first_doubled = 0, 0, []
     for cells in csv.reader(body, delimiter=delimiter):
@@ -103,7 +97,7 @@ def read_table(path: Path, *first_columns: str) -> ImuTable:
         raise InputError(f"{path}: no samples below the header; export the recording again")
     return ImuTable(
         path=path,
-        preamble=tuple(lines[:index]),
+        preamble=tuple(preamble),
         columns=columns,
         units=units,
         rows=np.frombuffer(values).reshape(-1, len(columns)),

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from fusecap.errors import InputError
+from fusecap.inputs import SENSORS, read_lines
 from fusecap.sources.imu_files.loader import ImuFormat
-from fusecap.sources.imu_files.table import chosen, number, read_lines
+from fusecap.sources.imu_files.table import chosen, number
 from fusecap.sources.imu_files.track import ImuTrack, tidy
 
 
@@ -42,7 +43,7 @@ def sensors(path: Path) -> tuple[str, ...]:
 
 
 def _table(path: Path) -> tuple[list[str], list[str]]:
-    lines = [line.strip() for line in read_lines(path)]
+    lines = [line.strip() for line in read_lines(path, SENSORS)]
     if "endheader" not in lines:
         raise InputError(f"{path}: no 'endheader' line; expected an OpenSense .sto")
     start = lines.index("endheader")
