@@ -51,7 +51,8 @@ from fusecap.exports.take_format import ExportOptions
 from fusecap.feet import foot_events, standing
 from fusecap.geometry.camera import Rig
 from fusecap.sources.imu_files.formats.sto import FORMAT as STO
-from fusecap.take import save_take
+from fusecap.stored_take import StoredTake, load_take
+from fusecap.take import BLOCK, save_take
 from motions import person, take_of, walk
 
 ODD_NAMES = ('a,b/"c" 100%s', "Zoë 🙂")
@@ -277,6 +278,26 @@ def test_what_a_file_cannot_hold_goes_into_several(tmp_path, monkeypatch):
     assert [p.name for p in paths] == [f"t_anna.part{n}.c3d" for n in (1, 2, 3)]
     counts = [ezc3d.c3d(str(p))["data"]["points"].shape[2] for p in paths]
     assert counts == [10, 10, 5]
+
+
+def test_a_full_c3d_file_has_its_rotations_where_readers_find_them(tmp_path):
+    """ezc3d, and others, take the number of their first block for a signed one of 16 bits."""
+    ezc3d = pytest.importorskip("ezc3d")
+    shape = person(1.7, EXTENDED23)
+    rest = np.zeros((1, 1, EXTENDED23.pose_size))
+    rest[..., 1] = shape.standing_root_height_m
+    frames = format_named("c3d").max_frames
+    assert frames
+    theta = np.repeat(rest, frames, axis=1)
+    theta[0, :, 0] = np.arange(frames) * 1e-4
+    (path,) = export_take(
+        take_of(theta, [shape], names=("anna",)), tmp_path, format="c3d", stem="t"
+    )
+    read = ezc3d.c3d(str(path))
+    assert 0 < read["parameters"]["ROTATION"]["DATA_START"]["value"][0] < 1 << 15
+    assert read["data"]["points"].shape[2] == read["data"]["rotations"].shape[3] == frames
+    across_mm = read["data"]["rotations"][0, 3, 0]
+    np.testing.assert_allclose(across_mm, 1e3 * theta[0, :, 0], atol=1e3 * NEAR_M)
 
 
 def replaced_max(frames):
@@ -767,3 +788,35 @@ def test_where_a_format_holds_the_last_pose_is_told(tmp_path):
     ]
     command = ["export", str(tmp_path / "t.npz"), "--format", "usd,glb"]
     assert "not tracked" not in CliRunner().invoke(app, command).output
+
+
+@pytest.mark.parametrize("name", [*(set(FORMATS) - {"fbx", "openpose"})])
+def test_a_take_in_its_file_is_read_in_blocks_and_written_as_the_same(name, tmp_path, monkeypatch):
+    try:
+        format_named(name).check_needs()
+    except InputError as error:
+        pytest.skip(str(error))
+    save_take(with_gap(two_walkers(2100), slice(2000, 2090)), tmp_path / "t.npz")
+    made, read, plain_read = {}, [], StoredTake._read
+
+    def noted(stored, spans):
+        read.append(sum(end - first for first, end in spans))
+        return plain_read(stored, spans)
+
+    whole = load_take(tmp_path / "t.npz")
+    monkeypatch.setattr(StoredTake, "_read", noted)
+    with StoredTake(tmp_path / "t.npz") as stored:
+        for way, take in {"file": stored, "memory": whole}.items():
+            paths = export_take(take, tmp_path / way, format=name, stem="t")
+            made[way] = [path.read_bytes() for path in paths]
+    assert made["file"] == made["memory"]
+    assert max(read, default=0) <= (BLOCK if name != "c3d" else 2100)
+
+
+def test_a_gap_across_two_blocks_holds_the_last_pose():
+    take = with_gap(two_walkers(2 * BLOCK + 60), slice(BLOCK - 10, 2 * BLOCK + 20))
+    motion = rig_motion(take, 0, PRESETS["native"])
+    held = slice(BLOCK - 11, 2 * BLOCK + 20)
+    for values in (motion.position_m, motion.rotation_xyzw):
+        assert (values[held] == values[BLOCK - 11]).all()
+    assert (np.einsum("tji,tji->tj", motion.rotation_xyzw[1:], motion.rotation_xyzw[:-1]) > 0).all()

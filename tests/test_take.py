@@ -307,8 +307,16 @@ def test_frames_in_the_file_are_those_of_the_whole(tmp_path, take, packed):
         stored.check()
         for part, expected in (
             (stored.of_frames(1, 3), whole.of_frames(1, 3)),
+            (stored.of_frames(2, 99), whole.of_frames(2, 99)),
             (stored.at_frames([0, 2]), whole.at_frames([0, 2])),
+            (stored.at_frames([0, 1, 3]), whole.at_frames([0, 1, 3])),
+            (stored.at_frames([]), whole.at_frames([])),
+            (
+                stored.of_subjects([1, 0]).of_subjects([0]).of_frames(1, 3),
+                whole.of_subjects([1]).of_frames(1, 3),
+            ),
         ):
+            assert part.subject_names == expected.subject_names
             for name in ("timestamps_ns", "tracked", *MOTION):
                 np.testing.assert_array_equal(getattr(part, name), getattr(expected, name))
         assert stored.subject_names == whole.subject_names and stored.skeleton == whole.skeleton

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from collections.abc import Sequence
 from dataclasses import replace
@@ -18,14 +19,12 @@ from fusecap.body.shape import BodyShape
 from fusecap.body.skeleton import Skeleton
 from fusecap.errors import TakeError
 from fusecap.inputs import TAKE, NpzFile, read_npz
-from fusecap.take import FORMAT, FORMAT_NAME, MARKS, MOTION, Take, array_shapes
+from fusecap.take import BLOCK, FORMAT, FORMAT_NAME, MARKS, MOTION, Take, array_shapes
 
 _ENTRIES = (
     *("format", "timestamps_ns", "rate_hz", "subject_names", "skeleton", "bone_names", "parents"),
     *("heights_m", "offsets_m", *MARKS, *MOTION, "provenance"),
 )
-_BLOCK = 2048
-"""Frames read at a time where all are."""
 
 
 class StoredTake:
@@ -65,6 +64,8 @@ class StoredTake:
             raise ValueError("provenance is no table")
         bone_names = tuple(array("bone_names").tolist())
         s, t, b = len(names), len(self.timestamps_ns), len(bone_names)
+        self._rows: Sequence[int] = range(s)
+        """Of the file."""
         self._motion = {name: self._file.rows(name) for name in MOTION}
         for name, shape in array_shapes(s, t, b).items():
             if name == "measured" and not told:
@@ -107,6 +108,16 @@ class StoredTake:
         return self._nothing.bone_names
 
     @property
+    def parents(self) -> tuple[int, ...]:
+        """Of the bones."""
+        return self._nothing.parents
+
+    @property
+    def rate_hz(self) -> float:
+        """Frames in a second."""
+        return self._nothing.rate_hz
+
+    @property
     def skeleton(self) -> Skeleton:
         """The tree of bones."""
         return self._nothing.skeleton
@@ -130,18 +141,34 @@ class StoredTake:
         """The body of one subject."""
         return self._nothing.shape(subject)
 
+    def subject(self, name: str) -> int:
+        """Index of the subject called `name`; raises `TakeError` naming the nearest one."""
+        return self._nothing.subject(name)
+
+    def of_subjects(self, rows: Sequence[int]) -> StoredTake:
+        """The same take with these subjects alone, in this order; open as long as this one is."""
+        kept = list(rows)
+        part = copy.copy(self)
+        part.tracked, part.measured = self.tracked[kept], self.measured[kept]
+        part._nothing = self._nothing.of_subjects(kept)
+        part._rows = [self._rows[row] for row in kept]
+        return part
+
     def of_frames(self, first: int, end: int) -> Take:
         """From frame `first` up to, and without, frame `end`."""
-        return self._read([(at, min(at + _BLOCK, end)) for at in range(first, end, _BLOCK)])
+        end = min(end, len(self.timestamps_ns))
+        return self._read([(at, min(at + BLOCK, end)) for at in range(first, end, BLOCK)])
 
     def at_frames(self, frames: Sequence[int] | Int[np.ndarray, " n"]) -> Take:
         """These frames alone, which rise."""
-        return self._read([(int(at), int(at) + 1) for at in frames])
+        frames = np.asarray(frames, dtype=np.int64)
+        runs = np.split(frames, np.flatnonzero(np.diff(frames) != 1) + 1)
+        return self._read([(int(run[0]), int(run[-1]) + 1) for run in runs if len(run)])
 
     def check(self) -> None:
         """Reads all of it, and keeps nothing; raises `TakeError`."""
-        for first in range(0, len(self.timestamps_ns), _BLOCK):
-            self.of_frames(first, min(first + _BLOCK, len(self.timestamps_ns)))
+        for first in range(0, len(self.timestamps_ns), BLOCK):
+            self.of_frames(first, first + BLOCK)
 
     def close(self) -> None:
         """Nothing more is read."""
@@ -163,10 +190,10 @@ class StoredTake:
             if name in MOTION
         }
         for name, values in motion.items():
-            for row in range(people):
+            for row, stored in enumerate(self._rows):
                 at = 0
                 for first, end in spans:
-                    values[row, at : at + end - first] = self._motion[name].read(row, first, end)
+                    values[row, at : at + end - first] = self._motion[name].read(stored, first, end)
                     at += end - first
         frames = np.concatenate([np.arange(*span) for span in spans] or [np.empty(0, int)])
         try:

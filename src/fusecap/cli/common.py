@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -19,8 +20,7 @@ from fusecap.files import plain
 
 if TYPE_CHECKING:
     from fusecap.batch.solve import Solved
-    from fusecap.exports.take_files import TakeFile
-    from fusecap.exports.take_format import ExportOptions
+    from fusecap.exports.take_format import AnyTake, ExportOptions
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object for machines.")]
 Unit = Annotated[
@@ -112,39 +112,54 @@ def write_take(solved: Solved, path: Path, exports: Exports, *, picture: bool) -
     """
     from fusecap.exports.made_files import list_made, made_stem
     from fusecap.exports.take_files import held_poses, plan_files
+    from fusecap.stored_take import StoredTake
 
     if solved.report.interrupted:
         path = path.with_name(f"{path.stem}-interrupted{path.suffix}")
-    planned: list[TakeFile] = []
-    if exports.formats:
-        planned = plan_files(
-            solved.take,
-            path.parent,
-            formats=exports.formats,
-            stem=made_stem(path),
-            unit=exports.unit,
-            rig=exports.rig,
-            options=exports.options,
-        )
     solved.save(path)
     files = [path]
     frames = solved.report.instants
     image = path.with_suffix(".png")
     try:
-        for file in planned:
-            file.write(solved.take)
-            files.append(file.path)
-            list_made(path, files)
-        if picture and frames:
-            from fusecap.exports.plot import plot_take
+        with StoredTake(path) as take:
+            planned = plan_files(
+                take,
+                path.parent,
+                formats=exports.formats,
+                stem=made_stem(path),
+                unit=exports.unit,
+                rig=exports.rig,
+                options=exports.options,
+            )
+            for file in planned:
+                file.write(take)
+                files.append(file.path)
+                list_made(path, files)
+            if picture and frames:
+                from fusecap.exports.plot import plot_take
 
-            plot_take(solved.take, sorted({0, frames // 3, 2 * frames // 3, frames - 1}), image)
-            files.append(image)
+                plot_take(take, sorted({0, frames // 3, 2 * frames // 3, frames - 1}), image)
+                files.append(image)
+            for text in held_poses(take, planned):
+                note(text)
     finally:
         set_aside_earlier(path, files)
-    for text in held_poses(solved.take, planned) if planned else ():
-        note(text)
     return files
+
+
+@contextmanager
+def opened_take(path: Path) -> Iterator[AnyTake]:
+    """A take, which stays in its file, or the poses of a recording as they were sent."""
+    from fusecap.recording.layout import SUFFIX
+    from fusecap.stored_take import StoredTake
+
+    if path.suffix == SUFFIX:
+        from fusecap.batch.replay import open_take
+
+        yield open_take(path)
+    else:
+        with StoredTake(path) as take:
+            yield take
 
 
 def set_aside_earlier(take: Path, files: Iterable[Path]) -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from fusecap.cli.common import Json, RigName, Unit, checked_exports, print_json
+from fusecap.cli.common import Json, RigName, Unit, checked_exports, opened_take, print_json
 from fusecap.cli.many import (
     Again,
     OnRay,
@@ -24,7 +26,7 @@ from fusecap.exports.formats import FORMATS
 
 if TYPE_CHECKING:
     from fusecap.exports.take_files import TakeFile
-    from fusecap.take import Take
+    from fusecap.exports.take_format import AnyTake
 
 EXAMPLE = "Example: fusecap export take.npz --format bvh,glb --rig mixamo --out files"
 _FORMATS_HELP = "One, or several with commas. " + "; ".join(
@@ -91,37 +93,39 @@ def already(
     """
     if session is not None:
         return None
-    _, planned = _plan(path, out, format, unit, rig, session)
-    files = [file.path for file in planned]
+    with _planned(path, out, format, unit, rig, session) as (_, planned):
+        files = [file.path for file in planned]
     return {"files": [str(file) for file in files]} if are_newer(files, [path]) else None
 
 
-def _plan(
-    take: Path, out: Path | None, format: str, unit: str | None, rig: str, session: Path | None
-) -> tuple[Take, list[TakeFile]]:
-    from fusecap.batch.replay import open_take
+@contextmanager
+def _planned(
+    path: Path, out: Path | None, format: str, unit: str | None, rig: str, session: Path | None
+) -> Iterator[tuple[AnyTake, list[TakeFile]]]:
+    """The take, and what to write of it."""
     from fusecap.exports.made_files import made_stem
     from fusecap.exports.take_files import plan_files
     from fusecap.exports.take_format import ExportOptions
-    from fusecap.sources.session_cameras import common_landmarks, open_rig
-    from fusecap.sources.session_file import load_session
 
     exports = checked_exports("--format", format, unit, rig)
     options = ExportOptions()
     if session is not None:
+        from fusecap.sources.session_cameras import common_landmarks, open_rig
+        from fusecap.sources.session_file import load_session
+
         loaded = load_session(session)
         options = ExportOptions(cameras=open_rig(loaded)[0], landmarks=common_landmarks(loaded))
-    opened = open_take(take)
-    planned = plan_files(
-        opened,
-        out or take.parent,
-        formats=exports.formats,
-        stem=made_stem(take),
-        unit=exports.unit,
-        rig=exports.rig,
-        options=options,
-    )
-    return opened, planned
+    with opened_take(path) as take:
+        files = plan_files(
+            take,
+            out or path.parent,
+            formats=exports.formats,
+            stem=made_stem(path),
+            unit=exports.unit,
+            rig=exports.rig,
+            options=options,
+        )
+        yield take, files
 
 
 def _export_one(
@@ -137,13 +141,13 @@ def _export_one(
     from fusecap.exports.made_files import list_made
     from fusecap.exports.take_files import held_poses
 
-    opened, planned = _plan(take, out, format, unit, rig, session)
     files: list[Path] = []
-    for file in planned:
-        file.write(opened)
-        files.append(file.path)
-        list_made(take, files)
-    notes = held_poses(opened, planned)
+    with _planned(take, out, format, unit, rig, session) as (opened, planned):
+        for file in planned:
+            file.write(opened)
+            files.append(file.path)
+            list_made(take, files)
+        notes = held_poses(opened, planned)
     if as_json:
         print_json({"files": [str(path) for path in files], "notes": notes})
         return

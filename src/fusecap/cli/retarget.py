@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from fusecap.cli.common import Json, named_once, print_json
+from fusecap.cli.common import Json, named_once, opened_take, print_json
 from fusecap.cli.terminal import console, note, table_of, wrote
 from fusecap.files import safe_name
 
@@ -38,7 +38,6 @@ def retarget(
 
     Bones are matched by VRM's map or by their names, and shown.
     """
-    from fusecap.batch.replay import open_take
     from fusecap.exports.characters.retarget import retarget as onto
     from fusecap.exports.made_files import list_made, made_stem
     from fusecap.exports.take_files import held_pose
@@ -46,16 +45,16 @@ def retarget(
     whose = "" if subject is None else f"_{safe_name(subject)}"
     stem = f"{made_stem(take)}{whose}_{safe_name(character.stem)}"
     ending = ".fbx" if character.suffix.lower() == ".fbx" else ".glb"
-    opened = open_take(take)
-    done = onto(
-        opened,
-        character,
-        out or take.with_name(stem + ending),
-        subject=subject,
-        bones=named_once("--map", map, "BONE=NAME"),
-    )
+    with opened_take(take) as opened:
+        done = onto(
+            opened,
+            character,
+            out or take.with_name(stem + ending),
+            subject=subject,
+            bones=named_once("--map", map, "BONE=NAME"),
+        )
+        notes = held_pose(opened, done.subject, [done.path.suffix])
     list_made(take, [done.path])
-    notes = held_pose(opened, done.subject, [done.path.suffix])
     if as_json:
         told = {"files": [str(done.path)], "bones": done.bones, "scale": done.scale}
         print_json({**told, "notes": notes})

@@ -116,7 +116,7 @@ def already(path: Path, **options: Any) -> dict[str, Any] | None:
     from fusecap.exports.take_files import plan_files
     from fusecap.recording.layout import SUFFIX
     from fusecap.sources.session_file import input_files, load_session
-    from fusecap.stored_take import StoredTake, load_take
+    from fusecap.stored_take import StoredTake
     from fusecap.take import made_by
 
     if path.suffix == SUFFIX:
@@ -128,16 +128,13 @@ def already(path: Path, **options: Any) -> dict[str, Any] | None:
     try:
         if not are_newer(wanted, inputs):
             return None
-        with StoredTake(target) as stored:
-            told = stored.provenance
         exports = checked_exports(
             "--export", options["export"] or "", options["unit"], options["rig"]
         )
-        if told.get("made_by") != made_by() or not isinstance(told.get("report"), dict):
-            return None
-        if exports.formats:
+        with StoredTake(target) as stored:
+            told = stored.provenance
             planned = plan_files(
-                load_take(target),
+                stored,
                 target.parent,
                 formats=exports.formats,
                 stem=made_stem(target),
@@ -145,8 +142,10 @@ def already(path: Path, **options: Any) -> dict[str, Any] | None:
                 rig=exports.rig,
                 options=exports.options,
             )
-            if not are_newer([file.path for file in planned], [target]):
-                return None
+        if told.get("made_by") != made_by() or not isinstance(told.get("report"), dict):
+            return None
+        if planned and not are_newer([file.path for file in planned], [target]):
+            return None
     except TakeError:
         return None
     return {**told["report"], "files": [str(target)]}

@@ -16,7 +16,7 @@ import numpy as np
 
 from fusecap.angles.gait import PERCENT, GaitCycles
 from fusecap.angles.joint_angles import JointAngles
-from fusecap.exports.opensim import motion_table
+from fusecap.exports.opensim import write_motion
 from fusecap.files import write_whole
 
 
@@ -40,7 +40,7 @@ def write_angles_mot(angles: JointAngles, subject: int, path: Path) -> None:
     names = [*angles.names, *(f"{name}_sd" for name in angles.names)]
     values = np.concatenate([angles.deg[subject], angles.sd_deg[subject]], axis=1)
     tracked = np.isfinite(values).all(axis=1)
-    write_whole(path, motion_table("Angles", names, angles.time_s[tracked], values[tracked]))
+    write_motion(path, "Angles", names, angles.time_s[tracked], values[tracked])
 
 
 def write_gait_csv(people: Sequence[tuple[str, GaitCycles]], path: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ COLOURS = (
 """Of people, in order; linear light."""
 
 
-def people_at_rest(motions: Sequence[RigMotion]) -> tuple[Gltf, list[tuple[RigMotion, list[int]]]]:
+def people_at_rest(motions: Iterable[RigMotion]) -> tuple[Gltf, list[tuple[RigMotion, list[int]]]]:
     """A document of everybody, one in the other, and everybody's nodes by joint."""
     gltf, people = Gltf.new(made_by()), []
     for row, motion in enumerate(motions):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float
 
@@ -14,10 +16,12 @@ _AXIS_M = 0.08
 """From a joint to the markers that show its bone's axes."""
 
 
-def bone_markers(
-    shape: BodyShape, *, axes: bool = True
-) -> list[tuple[str, str, Float[np.ndarray, "3"]]]:
-    """Markers as name, bone and place in the bone's frame [m].
+Marker = tuple[str, str, Float[np.ndarray, "3"]]
+"""Name, bone and place in the bone's frame [m]."""
+
+
+def bone_markers(shape: BodyShape, *, axes: bool = True) -> list[Marker]:
+    """The markers of a body.
 
     Landmarks, joints that none of them marks, and with `axes` two more per bone that show how it
     is turned.
@@ -33,14 +37,10 @@ def bone_markers(
     return points
 
 
-def marker_positions_m(
-    take: Take, *, axes: bool = True
-) -> tuple[list[str], Float[np.ndarray, "t m 3"]]:
+def marker_positions_m(take: Take, markers: Sequence[Marker]) -> Float[np.ndarray, "t m 3"]:
     """The one subject's markers in our world; NaN where untracked."""
-    points = bone_markers(take.shape(0), axes=axes)
-    bones = np.array([take.skeleton.bone(bone) for _, bone, _ in points])
-    at = np.array([place for _, _, place in points])
-    places = landmarks_in_world(
+    bones = np.array([take.skeleton.bone(bone) for _, bone, _ in markers])
+    at = np.array([place for _, _, place in markers])
+    return landmarks_in_world(
         take.bone_position_in_world_m[0], take.bone_rotation_in_world(0), bones, at
     )
-    return [name for name, _, _ in points], places

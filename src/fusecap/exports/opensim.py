@@ -10,9 +10,9 @@ flexion forward, adduction and inward rotation are positive, and so is a bent kn
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -23,7 +23,8 @@ from fusecap.exports.euler import euler_rad
 from fusecap.exports.markers import bone_markers
 from fusecap.exports.rest_rig import RestRig
 from fusecap.exports.rig_motion import rig_motion
-from fusecap.take import Take
+from fusecap.exports.take_format import AnyTake
+from fusecap.files import written_whole
 
 OPENSIM_FROM_OURS = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 
@@ -93,7 +94,7 @@ def coordinates(body: str) -> tuple[Coordinate, Coordinate, Coordinate]:
     )
 
 
-def opensim_preset(take: Take) -> RigPreset:
+def opensim_preset(take: AnyTake) -> RigPreset:
     """Our bones under OpenSim's names, standing with arms down."""
     names = [body_name(bone) for bone in take.bone_names]
     return RigPreset(
@@ -112,26 +113,30 @@ def opensim_preset(take: Take) -> RigPreset:
     )
 
 
-def coordinate_values(take: Take) -> tuple[list[str], Float[np.ndarray, "t c"]]:
+def coordinate_values(take: AnyTake) -> tuple[list[str], Float[np.ndarray, "t c"]]:
     """Names and values of all coordinates of the take's one subject [deg, m]."""
     motion = rig_motion(take, 0, opensim_preset(take))
-    rotation = OPENSIM_FROM_OURS @ motion.rotation_from_rest() @ OPENSIM_FROM_OURS.T
     names, columns = [], []
     for joint, body in enumerate(motion.rest.names):
         turns = coordinates(body)
         signs = [sum(turn.axis) for turn in turns]
         names += [turn.name for turn in turns]
-        columns.append(np.degrees(euler_rad(rotation[:, joint], "ZXY")) * signs)
+        rotation = OPENSIM_FROM_OURS @ motion.rotation_from_rest(joint) @ OPENSIM_FROM_OURS.T
+        columns.append(np.degrees(euler_rad(rotation, "ZXY")) * signs)
         if joint == 0:
             names += TRANSLATIONS
             columns.append(motion.position_m[:, 0] @ OPENSIM_FROM_OURS.T)
     return names, np.concatenate(columns, axis=1)
 
 
-def motion_table(
-    title: str, names: Sequence[str], time_s: Float[np.ndarray, " t"], deg: Float[np.ndarray, "t c"]
-) -> str:
-    """The text of a MOT file of columns in degrees (and metres)."""
+def write_motion(
+    path: Path,
+    title: str,
+    names: Sequence[str],
+    time_s: Float[np.ndarray, " t"],
+    deg: Float[np.ndarray, "t c"],
+) -> None:
+    """A MOT file of columns in degrees (and metres), whole or not at all."""
     head = [
         title,
         "version=1",
@@ -141,9 +146,9 @@ def motion_table(
         "endheader",
         "\t".join(("time", *names)),
     ]
-    table = io.StringIO()
-    np.savetxt(table, np.column_stack([time_s, deg]), fmt="%.6f", delimiter="\t")
-    return "\n".join(head) + "\n" + table.getvalue()
+    with written_whole(path) as file:
+        file.write(("\n".join(head) + "\n").encode())
+        np.savetxt(file, np.column_stack([time_s, deg]), fmt="%.6f", delimiter="\t")
 
 
 def opensim_markers(shape: BodyShape, rest: RestRig) -> list[OpensimMarker]:

@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from fusecap.exports.stick_figures import Sticks, TakeSticks, passing
+from fusecap.exports.take_format import AnyTake
 from fusecap.files import write_picture
-from fusecap.take import Take
 
 _VIEWS = {
     "front (from +z)": (0, 1),
@@ -25,7 +25,7 @@ _GREY = "0.65"
 """Of passers-by, and of bones that nothing measures."""
 
 
-def plot_take(take: Take, frames: Sequence[int], path: Path | str) -> None:
+def plot_take(take: AnyTake, frames: Sequence[int], path: Path | str) -> None:
     """One row of front, side and top views per frame, a colour per subject, written as a PNG.
 
     Passers-by are grey, and do not widen a view; bones that nothing measures are dotted and grey.

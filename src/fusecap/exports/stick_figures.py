@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float
 
 from fusecap.body.shape import BodyShape, end_offsets_m
 from fusecap.body.skeleton import Skeleton
+from fusecap.exports.take_format import AnyTake
 from fusecap.geometry.quaternions import from_wxyz
-from fusecap.take import Take
 
 MEASURED_QUALITY = 0.25
 """Of a bone (`fusecap.types.quality_of`): at less, 26 deg, its pose is hardly more than the prior's
@@ -71,21 +71,21 @@ class StickFigure:
 class TakeSticks:
     """The people of a take."""
 
-    def __init__(self, take: Take) -> None:
+    def __init__(self, take: AnyTake) -> None:
         self.take = take
         self._figure = StickFigure(take.skeleton)
         self._shapes = [take.shape(row) for row in range(len(take.subject_names))]
 
     def at_frame(self, subject: int, frame: int) -> Sticks | None:
         """None where the person is not tracked."""
-        take = self.take
-        if not take.tracked[subject, frame]:
+        if not self.take.tracked[subject, frame]:
             return None
+        one = self.take.of_frames(frame, frame + 1)
         return self._figure.sticks(
             self._shapes[subject],
-            take.bone_position_in_world_m[subject, frame],
-            from_wxyz(take.bone_rotation_in_world_wxyz[subject, frame]).as_matrix(),
-            take.bone_quality[subject, frame],
+            one.bone_position_in_world_m[subject, 0],
+            from_wxyz(one.bone_rotation_in_world_wxyz[subject, 0]).as_matrix(),
+            one.bone_quality[subject, 0],
         )
 
     def at_time(self, subject: int, time_ns: int) -> Sticks | None:

@@ -16,9 +16,8 @@ import numpy as np
 from fusecap.body.rigs import rig_preset
 from fusecap.errors import InputError, TakeError, nearest
 from fusecap.exports.formats import FORMATS, format_named
-from fusecap.exports.take_format import UNITS_PER_M, ExportOptions, TakeFormat
+from fusecap.exports.take_format import UNITS_PER_M, AnyTake, ExportOptions, TakeFormat
 from fusecap.files import distinct_names
-from fusecap.take import Take
 
 _SPANS_TOLD = 3
 
@@ -35,7 +34,7 @@ class TakeFile:
     frames: tuple[int, int]
     """From the first up to, and without, the second."""
 
-    def write(self, take: Take) -> None:
+    def write(self, take: AnyTake) -> None:
         """Whole or not at all, of the take that it was planned for."""
         part = take if len(self.rows) == len(take.subject_names) else take.of_subjects(self.rows)
         if self.frames != (0, len(take.timestamps_ns)):
@@ -44,7 +43,7 @@ class TakeFile:
 
 
 def export(
-    take: Take,
+    take: AnyTake,
     path: Path | str,
     *,
     unit: str | None = None,
@@ -72,7 +71,7 @@ def export(
 
 
 def export_take(
-    take: Take,
+    take: AnyTake,
     folder: Path | str,
     *,
     format: str,
@@ -92,7 +91,7 @@ def export_take(
 
 
 def plan_files(
-    take: Take,
+    take: AnyTake,
     folder: Path | str,
     *,
     formats: Sequence[str],
@@ -139,7 +138,7 @@ def check_formats(
     ]
 
 
-def write_files(take: Take, files: Iterable[TakeFile]) -> list[Path]:
+def write_files(take: AnyTake, files: Iterable[TakeFile]) -> list[Path]:
     """Writes what was planned for the take; returns the paths."""
     paths: list[Path] = []
     for file in files:
@@ -148,7 +147,7 @@ def write_files(take: Take, files: Iterable[TakeFile]) -> list[Path]:
     return paths
 
 
-def held_poses(take: Take, files: Sequence[TakeFile]) -> list[str]:
+def held_poses(take: AnyTake, files: Sequence[TakeFile]) -> list[str]:
     """Of everyone who is not tracked throughout: when, and which files show the last pose then."""
     told = []
     for row, name in enumerate(take.subject_names):
@@ -158,7 +157,7 @@ def held_poses(take: Take, files: Sequence[TakeFile]) -> list[str]:
     return told
 
 
-def held_pose(take: Take, subject: str, endings: Iterable[str]) -> list[str]:
+def held_pose(take: AnyTake, subject: str, endings: Iterable[str]) -> list[str]:
     """When files of these endings show the last pose of somebody who is not tracked throughout."""
     tracked = take.tracked[take.subject(subject)]
     if tracked.all() or not tracked.any():
@@ -196,14 +195,16 @@ def _checked(
     return format, replace(options or ExportOptions(), unit=unit or format.units[0], rig=rig)
 
 
-def _people(take: Take) -> list[int]:
+def _people(take: AnyTake) -> list[int]:
     people = [row for row in range(len(take.subject_names)) if take.tracked[row].any()]
     if not people:
         raise TakeError("nobody is tracked in any frame of the take: there is nothing to export")
     return people
 
 
-def _planned(take: Take, base: Path, format: TakeFormat, options: ExportOptions) -> list[TakeFile]:
+def _planned(
+    take: AnyTake, base: Path, format: TakeFormat, options: ExportOptions
+) -> list[TakeFile]:
     ending = _unusual(format, options) + format.tag + format.suffix
     if format.per_person:
         return _one_each(take, base, ending, format, options)
@@ -216,14 +217,16 @@ def _unusual(format: TakeFormat, options: ExportOptions) -> str:
     return rig + (f".{options.unit}" if options.unit != format.units[0] else "")
 
 
-def _together(take: Take, path: Path, format: TakeFormat, options: ExportOptions) -> list[TakeFile]:
+def _together(
+    take: AnyTake, path: Path, format: TakeFormat, options: ExportOptions
+) -> list[TakeFile]:
     people = _people(take)
     rows = people if format.per_person else range(len(take.subject_names))
     return _in_parts(take, path, format, options, tuple(rows))
 
 
 def _one_each(
-    take: Take, base: Path, ending: str, format: TakeFormat, options: ExportOptions
+    take: AnyTake, base: Path, ending: str, format: TakeFormat, options: ExportOptions
 ) -> list[TakeFile]:
     names = distinct_names(take.subject_names)
     return [
@@ -236,7 +239,7 @@ def _one_each(
 
 
 def _in_parts(
-    take: Take, path: Path, format: TakeFormat, options: ExportOptions, rows: tuple[int, ...]
+    take: AnyTake, path: Path, format: TakeFormat, options: ExportOptions, rows: tuple[int, ...]
 ) -> list[TakeFile]:
     """One file, or `x.part1.c3d`, `x.part2.c3d` where the format holds no more frames."""
     count = len(take.timestamps_ns)

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.geometry.camera import Rig
-from fusecap.take import Take
+from fusecap.stored_take import StoredTake
+from fusecap.take import BLOCK, Take
 
+AnyTake = Take | StoredTake
+"""What is exported: half an hour in memory is half a gigabyte, in its file nothing."""
 UNITS_PER_M = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
 METRE = ("m",)
 METRE_AND_CM = ("m", "cm")
@@ -35,10 +38,16 @@ def nothing_needed() -> None:
     """A plain install is enough."""
 
 
+def blocks(take: AnyTake) -> Iterator[tuple[slice, Take]]:
+    """All of it, some frames at a time: which, and the take of them."""
+    for first in range(0, len(take.timestamps_ns), BLOCK):
+        yield slice(first, first + BLOCK), take.of_frames(first, first + BLOCK)
+
+
 class WriteTake(Protocol):
     """Writes everybody in a take, whole or not at all; raises `InputError`."""
 
-    def __call__(self, take: Take, path: Path, options: ExportOptions, /) -> None: ...
+    def __call__(self, take: AnyTake, path: Path, options: ExportOptions, /) -> None: ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

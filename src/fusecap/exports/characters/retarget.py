@@ -29,8 +29,8 @@ from fusecap.exports.characters.character import Character, read_character
 from fusecap.exports.fbx_motion import NodeMotion, write_fbx
 from fusecap.exports.gltf import Gltf
 from fusecap.exports.rig_motion import RigMotion, rig_motion, short_way
+from fusecap.exports.take_format import AnyTake
 from fusecap.geometry.two_bone import STRETCHED, least_turns, two_bone_turns
-from fusecap.take import Take
 
 _CHILD = {
     f"{side}_{bone}": f"{side}_{child}"
@@ -63,7 +63,7 @@ class Retargeted:
 
 
 def retarget(
-    take: Take,
+    take: AnyTake,
     character: Path | str,
     out: Path | str,
     *,
@@ -109,7 +109,7 @@ def retarget(
     )
 
 
-def _row(take: Take, subject: str | None) -> int:
+def _row(take: AnyTake, subject: str | None) -> int:
     if subject is not None:
         return take.subject(subject)
     people = [row for row in range(len(take.subject_names)) if take.tracked[row].any()]

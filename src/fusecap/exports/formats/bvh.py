@@ -27,9 +27,14 @@ from fusecap.body.rigs import rig_preset
 from fusecap.exports.euler import euler_rad
 from fusecap.exports.rest_rig import RestRig
 from fusecap.exports.rig_motion import rig_motion
-from fusecap.exports.take_format import METRE_AND_CM, UNITS_PER_M, ExportOptions, TakeFormat
+from fusecap.exports.take_format import (
+    METRE_AND_CM,
+    UNITS_PER_M,
+    AnyTake,
+    ExportOptions,
+    TakeFormat,
+)
 from fusecap.files import written_whole
-from fusecap.take import Take
 
 _ORDERS = ("ZXY", "YXZ", "ZYX", "XYZ", "YZX", "XZY")
 """The first that is safe: importers know Z X Y best."""
@@ -37,7 +42,7 @@ _SAFE = np.sin(np.radians(60.0))
 """Up to this middle angle no curve is steeper than twice what the joint turns."""
 
 
-def write_bvh(take: Take, path: Path, options: ExportOptions) -> None:
+def write_bvh(take: AnyTake, path: Path, options: ExportOptions) -> None:
     """Writes the one subject of `take`, whole or not at all.
 
     A frame where the subject is not tracked holds the pose before it, and one before the first
@@ -45,17 +50,17 @@ def write_bvh(take: Take, path: Path, options: ExportOptions) -> None:
     """
     motion = rig_motion(take, 0, rig_preset(options.rig))
     scale = UNITS_PER_M[options.unit]
-    rotation = motion.rotation_from_rest()
     nested = _depth_first(motion.rest.parents)
     orders: dict[int, str] = {}
     columns: list[np.ndarray] = []
     for joint in nested:
-        orders[joint] = best_order(rotation[:, joint])
+        rotation = motion.rotation_from_rest(joint)
+        orders[joint] = best_order(rotation)
         if joint in motion.rest.travelling:
             parent = motion.rest.parents[joint]
             axes = motion.rest.rotation[parent] if parent >= 0 else np.eye(3)
             columns.append(motion.position_m[:, joint] @ axes.T * scale)
-        columns.append(np.degrees(euler_rad(rotation[:, joint], orders[joint])))
+        columns.append(np.degrees(euler_rad(rotation, orders[joint])))
     lines = [
         *_hierarchy(motion.rest, orders, scale),
         "MOTION",

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fusecap.exports.take_format import ExportOptions, TakeFormat
+from fusecap.exports.take_format import AnyTake, ExportOptions, TakeFormat, blocks
 from fusecap.files import written_whole
 from fusecap.take import Take
 
@@ -25,9 +25,8 @@ COLUMNS = (
 _NUMBERS = ",%.4f,%.4f,%.4f,%.5f,%.5f,%.5f,%.5f,%.2f,%.4f,%d"
 
 
-def write_csv(take: Take, path: Path, _: ExportOptions) -> None:
+def write_csv(take: AnyTake, path: Path, _: ExportOptions) -> None:
     """Writes everybody, whole or not at all."""
-    people = len(take.subject_names)
     rows = [
         "".join(f"%d,%.6f{_named(name, bone)}{_NUMBERS}\n" for bone in take.bone_names)
         for name in take.subject_names
@@ -35,21 +34,21 @@ def write_csv(take: Take, path: Path, _: ExportOptions) -> None:
     times = take.time_s.tolist()
     with written_whole(path) as file:
         file.write((",".join(COLUMNS) + "\n").encode())
-        for frame, time_s in enumerate(times):
-            for person in range(people):
-                if take.tracked[person, frame]:
-                    values = _values(take, person, frame, time_s)
+        for frames, part in blocks(take):
+            for here, time_s in enumerate(times[frames]):
+                for person in np.flatnonzero(part.tracked[:, here]).tolist():
+                    values = _values(part, person, here, frames.start + here, time_s)
                     file.write((rows[person] % tuple(values)).encode())
 
 
-def _values(take: Take, person: int, frame: int, time_s: float) -> list[float]:
-    table = np.empty((len(take.bone_names), 12))
+def _values(part: Take, person: int, here: int, frame: int, time_s: float) -> list[float]:
+    table = np.empty((len(part.bone_names), 12))
     table[:, 0], table[:, 1] = frame, time_s
-    table[:, 2:5] = take.bone_position_in_world_m[person, frame]
-    table[:, 5:9] = take.bone_rotation_in_world_wxyz[person, frame]
-    table[:, 9] = take.bone_sigma_deg[person, frame]
-    table[:, 10] = take.position_sigma_m[person, frame]
-    table[:, 11] = take.measured[person, frame]
+    table[:, 2:5] = part.bone_position_in_world_m[person, here]
+    table[:, 5:9] = part.bone_rotation_in_world_wxyz[person, here]
+    table[:, 9] = part.bone_sigma_deg[person, here]
+    table[:, 10] = part.position_sigma_m[person, here]
+    table[:, 11] = part.measured[person, here]
     return table.ravel().tolist()
 
 

@@ -11,11 +11,10 @@ from fusecap.exports.blender import blender_command
 from fusecap.exports.fbx_motion import NodeMotion, write_fbx
 from fusecap.exports.gltf_people import people_at_rest
 from fusecap.exports.rig_motion import rig_motions
-from fusecap.exports.take_format import ExportOptions, TakeFormat
-from fusecap.take import Take
+from fusecap.exports.take_format import AnyTake, ExportOptions, TakeFormat
 
 
-def write(take: Take, path: Path, options: ExportOptions) -> None:
+def write(take: AnyTake, path: Path, options: ExportOptions) -> None:
     """Writes one person, whole or not at all; raises `InputError` without Blender."""
     still, [(motion, nodes)] = people_at_rest(rig_motions(take, options.rig))
     holder = next(node for node in still.tree["nodes"] if nodes[0] in node.get("children", ()))

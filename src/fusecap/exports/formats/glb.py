@@ -10,11 +10,10 @@ from pathlib import Path
 
 from fusecap.exports.gltf_people import add_animation, hide_untracked, people_at_rest
 from fusecap.exports.rig_motion import rig_motions
-from fusecap.exports.take_format import ExportOptions, TakeFormat
-from fusecap.take import Take
+from fusecap.exports.take_format import AnyTake, ExportOptions, TakeFormat
 
 
-def write_glb(take: Take, path: Path, options: ExportOptions) -> None:
+def write_glb(take: AnyTake, path: Path, options: ExportOptions) -> None:
     """Writes everybody who is tracked, whole or not at all."""
     gltf, people = people_at_rest(rig_motions(take, options.rig))
     add_animation(gltf, people, "take", only_root_moves=False)

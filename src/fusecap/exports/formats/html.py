@@ -26,32 +26,32 @@ from fusecap.body.sticks import (
 from fusecap.exports.gltf_people import COLOURS
 from fusecap.exports.rest_rig import RestRig
 from fusecap.exports.rig_motion import RigMotion, rig_motions
-from fusecap.exports.take_format import ExportOptions, TakeFormat
-from fusecap.files import write_whole
-from fusecap.take import Take
+from fusecap.exports.take_format import AnyTake, ExportOptions, TakeFormat
+from fusecap.files import written_whole
 
 _MOST, _HIDDEN = 32767, -32768
+_DATA = '"data":null'
+"""Where a person's frames go; no name holds it, for its quotes are escaped."""
 
 
-def write_html(take: Take, path: Path, _: ExportOptions) -> None:
+def write_html(take: AnyTake, path: Path, _: ExportOptions) -> None:
     """Writes everybody, whole or not at all."""
-    motions = rig_motions(take, "native")
-    places = [_points_m(motion) for motion in motions]
-    reach_m = max(np.abs(points).max() for points in places)
-    step_m = max(1e-3, float(reach_m) / _MOST)
     people: list[dict[str, Any]] = []
-    for row, (motion, points) in enumerate(zip(motions, places, strict=True)):
-        steps = np.round(points / step_m).astype("<i2")
-        steps[~take.tracked[take.subject(motion.name)]] = _HIDDEN
+    places: list[np.ndarray] = []
+    for row, motion in enumerate(rig_motions(take, "native")):
+        points = np.concatenate([_points_m(part).astype(np.float32) for part in motion.blocks()])
+        points[~motion.tracked] = np.nan
+        places.append(points)
         people.append(
             {
                 "name": motion.name,
                 "colour": COLOURS[row % len(COLOURS)],
                 "sticks": _sticks(motion.rest),
                 "points": points.shape[1],
-                "data": base64.b64encode(steps.tobytes()).decode(),
+                "data": None,
             }
         )
+    step_m = max(1e-3, *(float(np.nanmax(np.abs(points))) / _MOST for points in places))
     told = {
         "title": path.stem,
         "step_m": step_m,
@@ -62,7 +62,14 @@ def write_html(take: Take, path: Path, _: ExportOptions) -> None:
     # No "<" of a name may end the script that holds it.
     data = json.dumps(told, separators=(",", ":")).replace("<", "\\u003c")
     page = (files("fusecap.exports") / "page.html").read_text(encoding="utf-8")
-    write_whole(path, page.replace("@TAKE@", data))
+    page = page.replace("@TAKE@", data)
+    with written_whole(path) as file:
+        for points in places:
+            above, mark, page = page.partition(_DATA)
+            steps = np.nan_to_num(np.round(points / step_m), nan=_HIDDEN).astype("<i2")
+            file.write(above.encode() + mark.replace("null", '"').encode())
+            file.write(base64.b64encode(steps.tobytes()) + b'"')
+        file.write(page.encode())
 
 
 def _points_m(motion: RigMotion) -> np.ndarray:

@@ -7,17 +7,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from fusecap.exports.opensim import coordinate_values, motion_table
-from fusecap.exports.take_format import ExportOptions, TakeFormat
-from fusecap.files import write_whole
-from fusecap.take import Take
+from fusecap.exports.opensim import coordinate_values, write_motion
+from fusecap.exports.take_format import AnyTake, ExportOptions, TakeFormat
 
 
-def write_mot(take: Take, path: Path, _: ExportOptions) -> None:
+def write_mot(take: AnyTake, path: Path, _: ExportOptions) -> None:
     """Writes the one subject of `take`, whole or not at all."""
     names, values = coordinate_values(take)
     tracked = take.tracked[0]
-    write_whole(path, motion_table("Coordinates", names, take.time_s[tracked], values[tracked]))
+    write_motion(path, "Coordinates", names, take.time_s[tracked], values[tracked])
 
 
 FORMAT = TakeFormat(suffix=".mot", write=write_mot, per_person=True)

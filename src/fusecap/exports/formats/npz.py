@@ -15,23 +15,29 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from fusecap.body.rigs import rig_preset
 from fusecap.errors import TakeError
+from fusecap.exports.rest_rig import RestRig
 from fusecap.exports.rig_motion import rig_motions
-from fusecap.exports.take_format import ExportOptions, TakeFormat
+from fusecap.exports.take_format import AnyTake, ExportOptions, TakeFormat
 from fusecap.files import written_whole
 from fusecap.stored_take import is_take
-from fusecap.take import Take
 
 
-def write_npz(take: Take, path: Path, options: ExportOptions) -> None:
+def write_npz(take: AnyTake, path: Path, options: ExportOptions) -> None:
     """Writes everybody who is tracked, whole or not at all; never over a take."""
     if is_take(path):
         raise TakeError(f"{path} is a take: export to another name")
-    motions = rig_motions(take, options.rig)
-    rest = [motion.rest for motion in motions]
-    rows = [take.subject(motion.name) for motion in motions]
+    rows = np.flatnonzero(take.tracked.any(axis=1))
+    joints = (len(rows), len(take.timestamps_ns), len(rig_preset(options.rig).joints))
+    position_m = np.empty((*joints, 3), dtype=np.float32)
+    xyzw = np.empty((*joints, 4), dtype=np.float32)
+    rest: list[RestRig] = []
+    for person, motion in enumerate(rig_motions(take, options.rig)):
+        position_m[person], xyzw[person] = motion.position_m, motion.rotation_xyzw
+        rest.append(motion.rest)
     arrays = {
-        "person_names": np.array([motion.name for motion in motions], dtype=np.str_),
+        "person_names": np.array(take.subject_names, dtype=np.str_)[rows],
         "joint_names": np.array(rest[0].names, dtype=np.str_),
         "parents": np.array(rest[0].parents),
         "time_s": take.time_s,
@@ -42,8 +48,8 @@ def write_npz(take: Take, path: Path, options: ExportOptions) -> None:
         "rest_rotation_xyzw": np.array(
             [Rotation.from_matrix(one.rotation).as_quat() for one in rest]
         ),
-        "position_m": np.array([motion.position_m for motion in motions], dtype=np.float32),
-        "rotation_xyzw": np.array([motion.rotation_xyzw for motion in motions], dtype=np.float32),
+        "position_m": position_m,
+        "rotation_xyzw": xyzw,
     }
     with written_whole(path) as file:
         np.savez(file, **arrays)

@@ -19,16 +19,13 @@ from fusecap.body.landmarks import LandmarkSet, landmark_set_named
 from fusecap.body.pose import landmarks_in_world
 from fusecap.errors import InputError, TakeError
 from fusecap.exports.openpose import frame_path, frame_text
-from fusecap.exports.take_format import ExportOptions, TakeFormat
+from fusecap.exports.take_format import AnyTake, ExportOptions, TakeFormat, blocks
 from fusecap.files import distinct_names
 from fusecap.geometry.camera import Camera
 from fusecap.take import Take
 
-_AT_ONCE = 1000
-"""Frames, so that memory does not grow with the take."""
 
-
-def write_openpose(take: Take, path: Path, options: ExportOptions) -> None:
+def write_openpose(take: AnyTake, path: Path, options: ExportOptions) -> None:
     """Writes all frames of all cameras, whole or not at all; a folder that was there is replaced.
 
     Raises `InputError` without cameras.
@@ -43,11 +40,10 @@ def write_openpose(take: Take, path: Path, options: ExportOptions) -> None:
             folders = [part / name for name in distinct_names(camera.name for camera in cameras)]
             for folder in folders:
                 folder.mkdir(parents=True)
-            for first in range(0, len(take.timestamps_ns), _AT_ONCE):
-                piece = take.of_frames(first, first + _AT_ONCE)
+            for frames, piece in blocks(take):
                 places = [_landmarks_m(piece, row, landmarks) for row in range(len(piece.tracked))]
                 for camera, folder in zip(cameras, folders, strict=True):
-                    _write_camera(folder, first, camera, piece.tracked, places)
+                    _write_camera(folder, frames.start, camera, piece.tracked, places)
             if path.exists():
                 shutil.rmtree(path)
             part.replace(path)

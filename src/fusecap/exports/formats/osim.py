@@ -21,14 +21,13 @@ from fusecap.exports.opensim import (
     opensim_preset,
 )
 from fusecap.exports.rest_rig import rest_rig
-from fusecap.exports.take_format import ExportOptions, TakeFormat
+from fusecap.exports.take_format import AnyTake, ExportOptions, TakeFormat
 from fusecap.files import safe_name, write_whole
-from fusecap.take import Take
 
 _AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
-def write_osim(take: Take, path: Path, _: ExportOptions) -> None:
+def write_osim(take: AnyTake, path: Path, _: ExportOptions) -> None:
     """Writes the one subject of `take`, whole or not at all."""
     shape = take.shape(0)
     rest = rest_rig(opensim_preset(take), shape_with_clavicles(shape))

@@ -22,14 +22,23 @@ from fusecap.exports.gltf_people import COLOURS
 from fusecap.exports.library import missing, written_by_name
 from fusecap.exports.rest_rig import RestRig
 from fusecap.exports.rig_motion import RigMotion, rig_motions
-from fusecap.exports.take_format import METRE_AND_CM, UNITS_PER_M, ExportOptions, TakeFormat
-from fusecap.take import Take
+from fusecap.exports.take_format import (
+    METRE_AND_CM,
+    UNITS_PER_M,
+    AnyTake,
+    ExportOptions,
+    TakeFormat,
+)
 
 
-def write_usd(take: Take, path: Path, options: ExportOptions) -> None:
+def write_usd(take: AnyTake, path: Path, options: ExportOptions) -> None:
     """Writes everybody, whole or not at all; raises `InputError` without usd-core."""
+    written_by_name(path, lambda part: _write_stage(take, part, options))
+
+
+def _write_stage(take: AnyTake, path: Path, options: ExportOptions) -> None:
     pxr = _pxr()
-    stage = pxr.Usd.Stage.CreateInMemory()
+    stage = pxr.Usd.Stage.CreateNew(str(path))
     scale = UNITS_PER_M[options.unit]
     pxr.UsdGeom.SetStageUpAxis(stage, pxr.UsdGeom.Tokens.y)
     pxr.UsdGeom.SetStageMetersPerUnit(stage, 1.0 / scale)
@@ -41,7 +50,7 @@ def write_usd(take: Take, path: Path, options: ExportOptions) -> None:
     stage.SetDefaultPrim(root.GetPrim())
     for row, motion in enumerate(rig_motions(take, options.rig)):
         _add_person(stage, motion, scale, COLOURS[row % len(COLOURS)])
-    written_by_name(path, lambda part: stage.Export(str(part)))
+        stage.Save()  # what is saved takes no memory
 
 
 def _pxr() -> Any:
@@ -75,11 +84,10 @@ def _add_person(stage: Any, motion: RigMotion, scale: float, colour: tuple[float
     animation.CreateJointsAttr(joints)
     animation.CreateScalesAttr(pxr.Vt.Vec3hArray(len(joints), (1, 1, 1)))
     rotations, translations = animation.CreateRotationsAttr(), animation.CreateTranslationsAttr()
-    xyzw = motion.rotation_xyzw.astype(np.float32)
-    places = (scale * motion.position_m).astype(np.float32)
-    for frame in range(len(motion.time_s)):
-        rotations.Set(pxr.Vt.QuatfArray.FromNumpy(xyzw[frame]), frame)
-        translations.Set(pxr.Vt.Vec3fArray.FromNumpy(places[frame]), frame)
+    for frame, xyzw in enumerate(motion.rotation_xyzw):
+        rotations.Set(pxr.Vt.QuatfArray.FromNumpy(xyzw), frame)
+        places = np.float32(scale) * motion.position_m[frame]
+        translations.Set(pxr.Vt.Vec3fArray.FromNumpy(places), frame)
     binding = pxr.UsdSkel.BindingAPI.Apply(skeleton.GetPrim())
     binding.CreateAnimationSourceRel().SetTargets([animation.GetPath()])
     _add_body(stage, f"{place}/{name}_body", rest, skeleton.GetPath(), scale, colour)

@@ -11,13 +11,13 @@ from pathlib import Path
 from fusecap.exports.gltf import Gltf
 from fusecap.exports.gltf_people import add_animation, add_joints
 from fusecap.exports.rig_motion import rig_motions
-from fusecap.exports.take_format import ExportOptions, TakeFormat
-from fusecap.take import Take, made_by
+from fusecap.exports.take_format import AnyTake, ExportOptions, TakeFormat
+from fusecap.take import made_by
 
 _EXTENSION = "VRMC_vrm_animation"
 
 
-def write_vrma(take: Take, path: Path, _: ExportOptions) -> None:
+def write_vrma(take: AnyTake, path: Path, _: ExportOptions) -> None:
     """Writes the one subject of `take`, whole or not at all."""
     gltf = Gltf.new(made_by())
     (motion,) = rig_motions(take, "vrm")
