@@ -210,6 +210,25 @@ def test_what_is_made_from_a_recording_and_from_its_take_stands_side_by_side(rec
     assert made[path] <= left and not left & made[take]
 
 
+def test_an_edited_take_finds_the_recording_that_it_came_from(recorded, tmp_path):
+    path, take = tmp_path / "run.mcap", tmp_path / "run-as-live.npz"
+    path.write_bytes(recorded.read_bytes())
+
+    def done(*command: str) -> str:
+        result = CliRunner().invoke(app, list(command))
+        assert result.exit_code == 0, result.output
+        return result.stdout
+
+    done("solve", str(path), "--as-live")
+    done("edit", str(take), "--trim", "0.2:", "--out", str(tmp_path / "short.npz"))
+    told = json.loads(done("report", str(tmp_path / "short.npz"), "--json"))
+    assert not told["notes"]
+    assert "<h2>Cameras</h2>" in (tmp_path / "short_report.html").read_text()
+    path.rename(tmp_path / "moved.mcap")
+    told = json.loads(done("report", str(tmp_path / "short.npz"), "--json"))
+    assert "does not stand beside" in told["notes"][0]
+
+
 MADE = (".csv", ".html", "_angles.csv", "_report.html", ".files.json")
 
 

@@ -228,12 +228,17 @@ def provenance(
     *,
     options: Mapping[str, Any],
     session_sha256: str | None = None,
+    recording: str | None = None,
     simulated: bool = False,
 ) -> dict[str, Any]:
-    """What a take says about its making: version, session, options, units, simulated or not."""
+    """What a take says about its making: version, session, options, units, simulated or not.
+
+    `recording` is the name of the file that it was solved from, if it was one.
+    """
     return {
         "made_by": made_by(),
         "session_sha256": session_sha256,
+        "recording": recording,
         "options": dict(options),
         "simulated": simulated,
         "units": UNITS,

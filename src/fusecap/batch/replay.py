@@ -93,6 +93,7 @@ def solve_as_live(recording: Recording, progress: Progress | None = None) -> tup
         provenance=provenance(
             options={"as_live": True, "cameras": list(again.setup.rig.names)},
             session_sha256=recording.sha256(),
+            recording=recording.path.name,
             simulated=again.setup.simulated,
         ),
     )

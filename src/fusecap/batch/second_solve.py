@@ -91,6 +91,7 @@ def solve_recording(
         _instants(setup, samples, times_ns),
         progress=progress,
         session_sha256=recording.sha256(),
+        recording=recording.path.name,
         simulated=setup.simulated,
         notes=(*loss_notes(recording), *(str(f) for f in found if f.severity != "info")),
     )

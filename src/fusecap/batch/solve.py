@@ -157,6 +157,7 @@ def solve_instants(
     *,
     progress: Progress | None = None,
     session_sha256: str | None = None,
+    recording: str | None = None,
     simulated: bool = False,
     notes: tuple[str, ...] = (),
 ) -> Solved:
@@ -181,6 +182,7 @@ def solve_instants(
             provenance=provenance(
                 options={"solver": asdict(setup.options), "cameras": list(setup.rig.names)},
                 session_sha256=session_sha256,
+                recording=recording,
                 simulated=simulated,
             ),
         )

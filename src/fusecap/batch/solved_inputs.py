@@ -38,8 +38,8 @@ def inputs_beside(path: Path, take: Take | StoredTake) -> tuple[Path | None, str
     expected = take.provenance.get("session_sha256")
     if not expected:
         return None, "the take does not say what it was solved from; name it with --session"
-    stem = path.stem.removesuffix("-interrupted").removesuffix("-as-live")
-    recording = path.with_name(stem + SUFFIX)
+    told = Path(str(take.provenance.get("recording") or "")).name
+    recording = path.with_name(told or path.stem + SUFFIX)
     session = path.with_name(FILE_NAME)
     changed = ""
     try:
