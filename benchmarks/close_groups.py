@@ -3,7 +3,7 @@
     uv run python benchmarks/close_groups.py [--training] [--cameras 4] [SCENE ...]
 
 Simulated (`evaluate/close_groups.py`), start positions known, 13 sensors or none; every camera
-loses each person in 0 or 30 % of half-second stretches. Solved as a take, each instant alone. IDF1,
+loses each person in 0 or 30 % of half-second stretches. Solved as `fusecap solve` does. IDF1,
 and switches of identity in ten seconds, over the frames in which some camera detects somebody: feet
 slide in these scenes, so where nobody is seen sensors cannot know the way.
 """
@@ -19,7 +19,6 @@ from fusecap.evaluate.close_groups import CLOSE_GROUPS, close_group_simulation, 
 from fusecap.evaluate.score import score_take
 from fusecap.evaluate.simulated_solve import solve_simulation
 from fusecap.evaluate.simulator import Simulation
-from fusecap.solve.options import SolverOptions
 from fusecap.take import Take
 
 CELLS = ((13, 0.0), (13, 0.3), (0, 0.0), (0, 0.3))
@@ -61,7 +60,7 @@ def main() -> None:
             )
             if loss:
                 simulation = with_losses(simulation, share=loss, seed=1)
-            take = solve_simulation(simulation, options=SolverOptions(window=1)).take
+            take = solve_simulation(simulation).take
             score = score_take(*both_seen(take, simulation), gate_m=0.5)
             row.append(f"{score.idf1:.3f}, {score.identity_switches}")
         print(f"| {scene} | " + " | ".join(row) + " |", flush=True)

@@ -91,13 +91,17 @@ class Anatomy:
         mean = np.where(known, step, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
         return np.sqrt(np.einsum("ti,ti->t", mean, mean))
 
-    def centre(self, landmarks: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "3"]:
+    def centre(self, landmarks: Float[np.ndarray, "*t k 3"]) -> Float[np.ndarray, "*t 3"]:
         """Middle of the torso [m], of all landmarks where it was not seen; NaN without any."""
-        torso = landmarks[self._torso]
-        torso = torso[np.isfinite(torso[:, 0])]
-        if len(torso) == 0:
-            torso = landmarks[np.isfinite(landmarks[:, 0])]
-        return torso.sum(axis=0) / len(torso) if len(torso) else np.full(3, np.nan)
+        torso = _middle(landmarks[..., self._torso, :])
+        known = np.isfinite(torso)
+        return torso if known.all() else np.where(known, torso, _middle(landmarks))
+
+
+def _middle(points: Float[np.ndarray, "*t k 3"]) -> Float[np.ndarray, "*t 3"]:
+    known = np.isfinite(points[..., :1])
+    count = known.sum(axis=-2)
+    return np.where(known, points, 0.0).sum(axis=-2) / np.where(count > 0, count, np.nan)
 
 
 def size_misfit(a: np.ndarray, b: np.ndarray) -> float:

@@ -254,7 +254,7 @@ class Tracker:
         for track, views in zip(moving, count[agreed], strict=True):
             self._count_frame(track, int(views), now_ns)
         if len(moving) > 1:
-            centre = np.array([self._anatomy.centre(t.landmarks) for t in moving])
+            centre = self._anatomy.centre(np.stack([track.landmarks for track in moving]))
             enough = min(self._options.birth_views, int(self._looking.sum()))
             part(moving, count[agreed], centre, self._options.duplicate_m, enough)
 
@@ -279,7 +279,7 @@ class Tracker:
         if not tracks:
             return
         now_ns = detections.timestamp_ns
-        doubt(tracks, np.array([self._anatomy.centre(track.landmarks) for track in tracks]), now_ns)
+        doubt(tracks, self._anatomy.centre(np.stack([t.landmarks for t in tracks])), now_ns)
         limbs, count = self._anatomy.limb_lengths(measured), (person >= 0).sum(axis=1)
         sizes.learn(tracks, limbs, count, self._options.birth_views, now_ns)
         if detections.appearance is not None:
