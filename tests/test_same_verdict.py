@@ -194,3 +194,24 @@ def test_a_single_frame_that_cannot_be_read_is_a_frame_without_people(spoil, sou
         if frame != session / FRAME:
             spoil(frame)
     assert verdict("doctor", session)[0] and verdict("solve", session)[0]
+
+
+@pytest.mark.parametrize("spoil", [None, garbage, empty, halved, drawing, pipe, gone])
+def test_a_video_that_cannot_be_read_beside_keypoints_is_told_by_both(
+    spoil, sound, solvable, tmp_path
+):
+    """Refused where nothing of that name can be a video at all, as it is without keypoints."""
+    session = shutil.copytree(solvable, tmp_path / "session")
+    shutil.copy(sound / VIDEO, session)
+    text = (session / "session.toml").read_text()
+    camera = 'keypoints = "keypoints/cam1"'
+    (session / "session.toml").write_text(
+        text.replace(camera, f'{camera}\nvideo = "{VIDEO}"\nrate_hz = 60')
+    )
+    if spoil is not None:
+        spoil(session / VIDEO)
+    refused = spoil in (pipe, gone)
+    for command in ("doctor", "solve"):
+        was_refused, said = verdict(command, session)
+        assert was_refused is refused, said
+        assert (VIDEO in said) == (spoil is not None)

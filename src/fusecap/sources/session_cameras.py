@@ -14,7 +14,7 @@ from fusecap.sources.detection_files import read_record
 from fusecap.sources.keypoint_files import KeypointTrack, read_keypoints, sets_in
 from fusecap.sources.offset_files import read_offsets
 from fusecap.sources.session import CameraSettings, Session
-from fusecap.sources.video import probe
+from fusecap.sources.video import check_video, probe
 
 
 def with_detections(session: Session) -> Session:
@@ -182,6 +182,26 @@ def camera_track(
         own_times=camera.rate_hz is None,
         progress=progress,
     )
+
+
+def unreadable_videos(session: Session) -> list[Finding]:
+    """Of cameras whose keypoints are there: nothing that is solved needs their videos."""
+    findings = []
+    for camera in session.cameras:
+        if camera.keypoints is None or camera.video is None or not camera.video.is_file():
+            continue
+        try:
+            check_video(camera.video)
+        except InputError as error:
+            findings.append(
+                Finding(
+                    severity="warning",
+                    where=f"camera '{camera.name}'",
+                    found=str(error),
+                    remedy="its keypoints are used; overlays and the viewer's pictures need it",
+                )
+            )
+    return findings
 
 
 def broken_files(track: KeypointTrack) -> Finding:

@@ -33,6 +33,7 @@ from fusecap.sources.session_cameras import (
     common_landmarks,
     open_rig,
     stepped_frames,
+    unreadable_videos,
     with_detections,
 )
 from fusecap.sources.session_sensors import (
@@ -187,7 +188,7 @@ def open_inputs(
                 findings.append(stepped_frames(track))
             track = on_clock(track, clocks.camera(track.name))
         keypoints.append(track)
-    findings += unplaced_wearers(session)
+    findings += unreadable_videos(session) + unplaced_wearers(session)
     imus: dict[str, list[ImuTrack | None]] = {}
     for subject in session.subjects:
         imus[subject.name] = [

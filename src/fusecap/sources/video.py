@@ -209,6 +209,12 @@ def probe(path: Path | str) -> VideoInfo:
     return Video(path).info
 
 
+def check_video(path: Path | str) -> None:
+    """Raises `InputError` for what is no video or cannot be decoded, without looking through it."""
+    with _opened(Path(path)):
+        pass
+
+
 def videos_in(folder: Path) -> list[Path]:
     """The video files of a folder by name; raises `InputError` where there are none."""
     found = sorted(
