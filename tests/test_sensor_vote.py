@@ -292,3 +292,22 @@ def test_who_was_out_of_sight_is_heard_anew():
         for _ in range(round(seconds * 60)):
             vote.hear([track], seen[None], {"anna": reading}, 1 / 60)
     assert vote.misfit(track, "anna", 0.25) < 0.05
+
+
+@pytest.mark.parametrize("also_fits", [False, True])
+def test_a_wearer_who_was_taken_for_somebody_without_sensors_gets_the_own_name(
+    simulation, also_fits
+):
+    cast = cast_of(simulation, "x", max_subjects=3)
+    first, second = (standing_at(simulation, n, 2.0 * n, 0.0, 5.0) for n in range(2))
+    cast.admit([first, second], 5 * 10**9, ToldVote({}))
+    assert [name for name, _ in cast.followed()] == ["x", "person1"]
+    told = ToldVote({(0, "x"): 0.7, (1, "x"): 0.05})
+    assert cast.pair_anew([first, second], told, 5 * 10**9) == {0: 1, 1: 0}
+    assert dict(cast.followed()) == {"x": second, "person1": first}
+    cast.forget([first], 6 * 10**9)
+    told = ToldVote({(1, "x"): 0.05, (5, "x"): 0.1 if also_fits else 0.9})
+    third = standing_at(simulation, 5, 9.0, 0.0, 6.0)
+    assert bool(cast.pair_anew([first, third], told, 6 * 10**9)) != also_fits
+    followed = {"person1": first} if also_fits else {"x": first}
+    assert dict(cast.followed()) == followed

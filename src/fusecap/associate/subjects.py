@@ -175,7 +175,10 @@ class Cast:
         unknown = [t for row, t in enumerate(now) if row not in told]
         cost[:, unknown] = np.inf
         strangers = [t not in [track for _, track in self.followed()] for t in tracks]
-        cost[np.ix_([t < 0 for t in now], strangers)] = np.inf  # They are for `admit`.
+        for row in np.flatnonzero(np.array(now) < 0):
+            # Who is not followed takes somebody's track only if it can be no other; see `admit`.
+            alike = (cost[row] < np.fmin.reduce(cost[row]) + MARGIN).sum() > 1
+            cost[row, np.array(strangers) | alike] = np.inf
         nobody = np.full((len(told), len(told)), FITS)
         choice = np.concatenate([np.where(cost < FITS, cost, np.inf)[told], nobody], axis=1)
         best = {told[r]: c if c < len(tracks) else -1 for r, c in cheapest(choice)}
@@ -214,15 +217,16 @@ class Cast:
         """Give places other tracks; by the id that a track had, the one it has then.
 
         The places `left` keep their identity and wait for whom it is; of others that lose a track,
-        each gets one that was given up.
+        each gets one that was given up, or waits too.
         """
         followed = {p.name: p.track for p in self._places if p.live and p.track}
         number = {p.name: p.track.track_id for p in self._places if p.track}
-        alone = {p.name for p in left}
         taken = list(given.values())
         freed = [t for name, t in followed.items() if name in given and t not in taken]
-        robbed = [n for n, t in followed.items() if n not in given and t in taken]
-        given.update({n: freed.pop() for n in robbed if n not in alone})
+        robbed = [p for p in self._places if p.live and p.name not in given and p.track in taken]
+        others = [p.name for p in robbed if p not in left]
+        given.update({n: freed.pop() for n in others[: len(freed)]})
+        left = [p for p in robbed if p.name not in given]
         spare = [track.track_id for track in taken if track not in followed.values()]
         spare += [next(self._ids) for _ in freed[len(spare) :]]
         number.update({n: next(self._ids) for n in given if n not in number})
