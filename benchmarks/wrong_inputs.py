@@ -441,7 +441,7 @@ class Error:
     """(S, B) means over the frames that both have."""
     orientation_deg: np.ndarray
     found_share: np.ndarray
-    """(S,) of the true frames."""
+    """(S,) of the true seconds."""
 
     def off(self, control: Error) -> bool:
         """Anybody's any bone by more than twice the control."""
@@ -512,8 +512,13 @@ def measure(take: Take, truth: Take, *, placed: bool) -> Error:
         away = (solved.inv() * true).magnitude().reshape(len(both), -1)
         position[true_subject] = 1e3 * np.linalg.norm(x - y, axis=2).mean(axis=0)
         orientation[true_subject] = np.degrees(away.mean(axis=0))
-        found[true_subject] = len(both) / int(truth.tracked[true_subject].sum())
+        found[true_subject] = _seconds(take, subject) / _seconds(truth, true_subject)
     return Error(position_mm=position, orientation_deg=orientation, found_share=found)
+
+
+def _seconds(take: Take, subject: int) -> float:
+    """For how long somebody is there; takes may have another rate than the truth."""
+    return float(take.tracked[subject].sum() * np.median(np.diff(take.time_s)))
 
 
 def kind_of(text: str) -> str:

@@ -138,6 +138,29 @@ def test_who_lies_below_cameras_at_the_ceiling_lies_and_the_world_stands(facing_
     assert any("away from up" in str(finding) for finding in findings) is told
 
 
+@pytest.mark.parametrize(
+    ("higher_m", "told"), [(0.0, False), (0.1, False), (-0.1, False), (0.2, True), (-0.2, True)]
+)
+def test_a_floor_that_is_off_by_a_fifth_of_a_metre_is_told(higher_m, told):
+    """However often feet are lifted, and with some people where nobody is."""
+    shape = BodyShape.from_height(PAPER21, 1.7)
+    posed = forward_kinematics(shape, np.zeros((1, PAPER21.pose_size)))
+    rest = landmarks_in_world(*posed, BODY25.bones(PAPER21), BODY25.offsets_m(shape))[0]
+    ankles = [BODY25.index(f"{side}_ankle") for side in ("left", "right")]
+    people = np.repeat(rest[None], 20, axis=0)
+    people[:, :, 1] += 0.09 + higher_m - rest[ankles, 1].min()
+    people[::2, ankles[0], 1] += 0.4
+    people[:5, ankles, 1] += 0.3
+    people[5:10, :, 1] -= 0.6
+    session = Session.model_validate(
+        {"session": {"name": "stand"}, "camera": [{"name": "c", "keypoints": "k"}]},
+        context={"file": Path("session.toml")},
+    )
+    findings = Findings()
+    _check_upright(session, ring(), people, BODY25, findings)
+    assert any("from the floor" in str(finding) for finding in findings) is told
+
+
 @pytest.mark.parametrize("worn", [(), ("thigh", "shank")])
 def test_limbs_that_nothing_measures_are_told(tmp_path, worn):
     path = write_session(tmp_path)

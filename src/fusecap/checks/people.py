@@ -30,6 +30,8 @@ MOST_MEASURED = 2000
 TILTED = np.cos(np.radians(45))
 WITH_CAMERAS = 0.5
 """Cosine of people to the tops of pictures: who lies below cameras at the ceiling lies anyhow."""
+ANKLE_M, FLOOR_TOLERANCE_M = 0.09, 0.16
+"""The lower one of who stands or walks, and how far off a floor may be that is called one."""
 LEAST_PEOPLE = 5
 LEAST_FACES = 20
 BACKWARDS_SHARE = 0.8
@@ -54,12 +56,13 @@ def _check_upright(
     left, right = landmarks.index("left_ankle"), landmarks.index("right_ankle")
     if left is None or right is None:
         return
+    lower_m = np.minimum(people[:, left, 1], people[:, right, 1])
     feet = (people[:, left] + people[:, right]) / 2
     body = people[:, top] - feet
     whole = np.isfinite(body).all(axis=1)
     if np.count_nonzero(whole) < LEAST_PEOPLE:
         return
-    body, feet = body[whole], feet[whole]
+    body, lower_m = body[whole], lower_m[whole]
     direction = np.median(body / np.linalg.norm(body, axis=1, keepdims=True), axis=0)
     direction /= max(float(np.linalg.norm(direction)), 1e-9)
     if direction[1] < TILTED:
@@ -67,12 +70,12 @@ def _check_upright(
         if up[1] < TILTED and direction @ up > WITH_CAMERAS:
             _add_tilted(session, direction, findings)
         return
-    ankle_m = float(np.median(feet[:, 1]))
-    if session.settings.floor and not -0.15 <= ankle_m <= 0.35:
+    ankle_m = float(np.median(lower_m))
+    if session.settings.floor and abs(ankle_m - ANKLE_M) > FLOOR_TOLERANCE_M:
         findings.add(
             "warning",
             "calibration",
-            f"ankles are {ankle_m:+.2f} m from the floor (y = 0)",
+            f"lower ankles are {ankle_m:+.2f} m from the floor (y = 0)",
             "fusecap calibrate world moves the origin to the floor; or set floor = false",
         )
 
