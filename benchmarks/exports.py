@@ -27,7 +27,7 @@ from fusecap.exports.characters.retarget import retarget
 from fusecap.exports.formats import FORMATS
 from fusecap.exports.take_files import export_take
 from fusecap.exports.take_format import ExportOptions
-from fusecap.stored_take import load_take
+from fusecap.stored_take import StoredTake
 from fusecap.take import Take, save_take, take_from_theta
 
 
@@ -54,14 +54,16 @@ def long_take(minutes: float, rate_hz: float = 60.0) -> Take:
 
 def write(name: str, stored: Path, folder: str) -> list[Path]:
     """What is written in a format, or for "onto.glb" and "onto.fbx" of one person's motion."""
-    take = load_take(stored)
-    if name.startswith("onto."):
-        (avatar,) = export_take(take.of_frames(0, 1), folder, format="glb", stem="c", rig="mixamo")
-        return [retarget(take, avatar, Path(folder) / name, subject="anna").path]
-    options = ExportOptions()
-    if name == "openpose":
-        options = ExportOptions(cameras=demo_scene(0, seconds=0.1).rig)
-    return export_take(take, folder, format=name, stem="t", options=options)
+    with StoredTake(stored) as take:
+        take.check()
+        if name.startswith("onto."):
+            still = take.of_frames(0, 1)
+            (avatar,) = export_take(still, folder, format="glb", stem="c", rig="mixamo")
+            return [retarget(take, avatar, Path(folder) / name, subject="anna").path]
+        options = ExportOptions()
+        if name == "openpose":
+            options = ExportOptions(cameras=demo_scene(0, seconds=0.1).rig)
+        return export_take(take, folder, format=name, stem="t", options=options)
 
 
 def measure(name: str, stored: Path) -> None:

@@ -813,6 +813,26 @@ def test_a_take_in_its_file_is_read_in_blocks_and_written_as_the_same(name, tmp_
     assert max(read, default=0) <= (BLOCK if name != "c3d" else 2100)
 
 
+def test_a_take_that_is_spoilt_far_inside_is_refused_before_anything_is_written(tmp_path):
+    save_take(two_walkers(BLOCK + 40), tmp_path / "t.npz")
+    with np.load(tmp_path / "t.npz") as archive:
+        arrays = dict(archive)
+    arrays["theta"][1, BLOCK + 20, 5] = np.nan
+    np.savez(tmp_path / "t.npz", **arrays)
+    out = tmp_path / "o"
+    command = [
+        "export",
+        str(tmp_path / "t.npz"),
+        "--format",
+        "csv,bvh",
+        "--out",
+        str(tmp_path / "o"),
+    ]
+    result = CliRunner().invoke(app, command)
+    assert isinstance(result.exception, TakeError) and "theta of 'ben'" in str(result.exception)
+    assert not out.exists()
+
+
 def test_a_gap_across_two_blocks_holds_the_last_pose():
     take = with_gap(two_walkers(2 * BLOCK + 60), slice(BLOCK - 10, 2 * BLOCK + 20))
     motion = rig_motion(take, 0, PRESETS["native"])

@@ -149,7 +149,7 @@ def write_take(solved: Solved, path: Path, exports: Exports, *, picture: bool) -
 
 @contextmanager
 def opened_take(path: Path) -> Iterator[AnyTake]:
-    """A take, which stays in its file, or the poses of a recording as they were sent."""
+    """A take, which is checked and stays in its file, or the poses of a recording as sent."""
     from fusecap.recording.layout import SUFFIX
     from fusecap.stored_take import StoredTake
 
@@ -159,6 +159,7 @@ def opened_take(path: Path) -> Iterator[AnyTake]:
         yield open_take(path)
     else:
         with StoredTake(path) as take:
+            take.check()
             yield take
 
 
