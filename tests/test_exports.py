@@ -790,7 +790,7 @@ def test_where_a_format_holds_the_last_pose_is_told(tmp_path):
     assert "not tracked" not in CliRunner().invoke(app, command).output
 
 
-@pytest.mark.parametrize("name", [*(set(FORMATS) - {"fbx", "openpose"})])
+@pytest.mark.parametrize("name", sorted(set(FORMATS) - {"fbx", "openpose"}))
 def test_a_take_in_its_file_is_read_in_blocks_and_written_as_the_same(name, tmp_path, monkeypatch):
     try:
         format_named(name).check_needs()

@@ -311,3 +311,17 @@ def test_a_wearer_who_was_taken_for_somebody_without_sensors_gets_the_own_name(
     assert bool(cast.pair_anew([first, third], told, 6 * 10**9)) != also_fits
     followed = {"person1": first} if also_fits else {"x": first}
     assert dict(cast.followed()) == followed
+
+
+@pytest.mark.parametrize(
+    ("born_s", "x_m", "found"),
+    [(0.0, 1.5, False), (0.8, 1.5, True), (0.8, 2.5, False), (1.9, 3.5, True), (9.0, 1.5, False)],
+)
+def test_whoever_is_found_late_may_have_walked_away_from_the_start(simulation, born_s, x_m, found):
+    anatomy, ids = Anatomy(simulation.landmark_set), itertools.count(100)
+    subjects = [Subject(name="x", start_m=(0.0, 0.0))]
+    cast = Cast(subjects, simulation.rig, anatomy, TrackerOptions(max_subjects=1), ids)
+    cast.admit([], 0, ToldVote({}))
+    newcomer = standing_at(simulation, 1, x_m, born_s, born_s + 2.0)
+    cast.admit([newcomer], newcomer.seen_ns, ToldVote({}))
+    assert bool(cast.followed()) == found

@@ -484,12 +484,19 @@ class Cast:
         return float(away / reach + misfit / o.size_tolerance)
 
     def _from_start_m(self, track: Track, place: Place) -> float:
-        """How far from where a subject begins a newcomer was first seen; 0 where nobody knows."""
+        """How far from where a subject can have gone from its start a newcomer was first seen.
+
+        0 where nobody knows.
+        """
         if place.start_m is None or self._single:
             return 0.0  # One camera gives no place to compare with.
         centre = self._anatomy.centre(track.landmarks)
         first_m = np.where(np.isfinite(track.born_m), track.born_m, centre)
-        return float(np.hypot(first_m[0] - place.start_m[0], first_m[2] - place.start_m[1]))
+        away_m = float(np.hypot(first_m[0] - place.start_m[0], first_m[2] - place.start_m[1]))
+        since_s = max(track.born_ns - (self._begun_ns or 0), 0) * 1e-9
+        if since_s > self._options.patience_s:
+            return away_m  # Who comes later comes to the start.
+        return max(away_m - self._options.reach_speed_m_s * since_s, 0.0)
 
     @staticmethod
     def _is_away(place: Place, now_ns: int) -> bool:
