@@ -43,8 +43,8 @@ class TrackerOptions:
     reach_speed_m_s: float = 1.5
     """Growth of that distance with the time unseen: a person walking on another way."""
     start_radius_m: float = 1.0
-    """A named subject is born within this distance of its start position: the paper's 1 m; whoever is
-    first seen in the first `patience_s` seconds farther, as far as they may have walked."""
+    """A named subject is born within this distance of its start position (the paper's 1 m); whoever
+    is first seen in the first `patience_s` seconds farther, as far as they may have walked."""
     duplicate_m: float = 0.3
     """Median landmark distance below which two skeletons are one person: the paper's 30 cm."""
     overlap_s: float = 0.5
