@@ -14,8 +14,8 @@ from fusecap.batch import sorting
 from fusecap.batch.assignments import Assignments
 from fusecap.batch.replay import solve_as_live
 from fusecap.batch.second_pass import SecondPass
-from fusecap.batch.second_solve import recorded_inputs
 from fusecap.batch.solve import SessionInstants, solve_instants
+from fusecap.batch.stored_instants import StoredInstants
 from fusecap.calibrate import offsets, shape
 from fusecap.calibrate.cameras import people
 from fusecap.calibrate.imus import session as imus
@@ -137,7 +137,8 @@ FIRST = ("batch/sorting", "batch/assignments")
 def test_ctrl_c_between_any_two_lines_leaves_the_first_instants_whole(run, modules, monkeypatch):
     monkeypatch.setattr(whole_motion, "PIECE", 4)
     monkeypatch.setattr(whole_motion, "AHEAD", 4)
-    setup, instants = recorded_inputs(run)
+    instants = StoredInstants(run)
+    setup = instants.setup
     with Pressing(modules, line=0) as whole_run:
         whole = solve_instants(setup, instants).take
     for line in np.linspace(1, whole_run.lines, 6).astype(int):
@@ -231,8 +232,9 @@ def test_the_second_ctrl_c_ends_a_solve_in_whichever_pass_it_comes(run, pressing
             solved.append(done)
             press()
 
+    instants = StoredInstants(run)
     with pytest.raises(KeyboardInterrupt):
-        solve_instants(*recorded_inputs(run), progress=press_again)
+        solve_instants(instants.setup, instants, progress=press_again)
     assert solved == [1]
 
 
@@ -246,6 +248,7 @@ def test_ctrl_c_after_the_last_instant_of_a_pass_leaves_a_whole_take(run, monkey
         return last(itself)
 
     monkeypatch.setattr(kind, asked, pressed)
-    setup, instants = recorded_inputs(run)
+    instants = StoredInstants(run)
+    setup = instants.setup
     report = solve_instants(setup, instants).report
     assert report.instants == len(instants) and not report.interrupted

@@ -18,8 +18,9 @@ from fusecap.batch.replay import (
     replay,
     solve_as_live,
 )
-from fusecap.batch.second_solve import solve_recording
+from fusecap.batch.second_solve import RecordedInstants, solve_recording
 from fusecap.batch.solve import solve_session
+from fusecap.batch.stored_instants import StoredInstants
 from fusecap.body.landmarks import LANDMARK_SETS
 from fusecap.cli import app
 from fusecap.doctor import diagnose_recording
@@ -122,6 +123,39 @@ def test_single_instants_of_a_recording_are_those_of_the_whole(recorded):
     np.testing.assert_array_equal(found, seen[0].people)
     assert detections.at(1, seen[0].timestamp_ns - 1) is None
     assert detections.at(1, seen[-1].timestamp_ns + 10**9) is None
+
+
+@pytest.mark.parametrize("without", [None, 1], ids=["all cameras", "one that is off for a while"])
+def test_instants_read_alone_are_those_of_all_samples_in_memory(run, tmp_path, without):
+    setup, taken = run
+    off = [
+        isinstance(event, CameraSample)
+        and event.camera == without
+        and 3e8 < event.timestamp_ns < 9e8
+        for event, _ in taken
+    ]
+    taken = [item for item, left_out in zip(taken, off, strict=True) if not left_out]
+    stored = StoredInstants(written(tmp_path / "run.mcap", setup, taken))
+    events = [event for event, _ in taken]
+    samples = [event for event in events if isinstance(event, CameraSample | ImuSample)]
+    times_ns = [event.timestamp_ns for event in events if isinstance(event, Tick)]
+    whole = RecordedInstants(
+        setup.session, len(setup.landmarks.landmark_names), samples, sorted(times_ns)
+    )
+    assert len(stored) == len(whole) > 50
+    for instant in (*range(0, len(whole), 3), 5):
+        detections, expected = stored.detections(instant), whole.detections(instant)
+        assert detections.timestamp_ns == expected.timestamp_ns
+        assert detections.looked == expected.looked
+        for found, there in zip(detections.people, expected.people, strict=True):
+            np.testing.assert_array_equal(found, there)
+        readings = stored.readings(instant)
+        assert readings.keys() == whole.readings(instant).keys()
+        for name, reading in whole.readings(instant).items():
+            for values in ("bone_rotation_in_world", "accel_in_world_m_s2"):
+                np.testing.assert_array_equal(
+                    getattr(readings[name], values), getattr(reading, values)
+                )
 
 
 def test_second_solve_is_as_good_as_that_of_the_session(run, recorded, folder):

@@ -52,8 +52,10 @@ class Replay:
         """Events that the engine refused with an error; it did so in the run as well."""
         self._recording = recording
 
-    def steps(self, progress: Progress | None = None) -> Iterator[LiveStep]:
-        """Every solved instant; once."""
+    def steps(
+        self, progress: Progress | None = None, last: int | None = None
+    ) -> Iterator[LiveStep]:
+        """Every solved instant; once. Nothing after the event of number `last`."""
         number, people = 0, {}
         for item in self._recording.items(progress):
             if isinstance(item, RecordedEvent):
@@ -65,6 +67,8 @@ class Replay:
                 if step is not None:
                     number, people = item.number, step.people
                     yield step
+                if item.number == last:
+                    return
             elif isinstance(item, RecordedPose) and item.number == number:
                 self.poses += 1
                 self.equal += _same(item, people.get(item.name))

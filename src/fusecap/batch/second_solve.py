@@ -24,7 +24,7 @@ from fusecap.errors import InputError
 from fusecap.geometry.quaternions import to_wxyz
 from fusecap.progress import Progress
 from fusecap.recording.reader import RecordedEvent, Recording
-from fusecap.setup import SessionSetup, Setup, setup_of
+from fusecap.setup import SessionSetup, setup_of
 from fusecap.sources.session import Session, SubjectSettings
 from fusecap.sources.session_data import MAX_INSTANTS
 from fusecap.types import (
@@ -88,26 +88,13 @@ def solve_recording(
         refuse_errors(recording.path, found)
     return solve_instants(
         setup_of(setup.session, setup.rig, setup.landmarks),
-        _instants(setup, samples, times_ns),
+        RecordedInstants(setup.session, len(setup.landmarks.landmark_names), samples, times_ns),
         progress=progress,
         session_sha256=recording.sha256(),
         recording=recording.path.name,
         simulated=setup.simulated,
         notes=(*loss_notes(recording), *(str(f) for f in found if f.severity != "info")),
     )
-
-
-def recorded_inputs(
-    recording: Recording, progress: Progress | None = None
-) -> tuple[Setup, RecordedInstants]:
-    """What a second solve works on; raises `InputError` where there is no instant."""
-    setup, samples, times_ns = _recorded(recording, progress)
-    instants = _instants(setup, samples, times_ns)
-    return setup_of(setup.session, setup.rig, setup.landmarks), instants
-
-
-def _instants(setup: SessionSetup, samples: list[Sample], times_ns: list[int]) -> RecordedInstants:
-    return RecordedInstants(setup.session, len(setup.landmarks.landmark_names), samples, times_ns)
 
 
 def _recorded(
@@ -117,24 +104,21 @@ def _recorded(
     setup = recorded_setup(recording)
     samples: list[Sample] = []
     ticks_ns: list[int] = []
-    commands: list[Command] = []
+    commands: list[RecordedEvent] = []
     for item in recording.items(progress):
         match item:
             case RecordedEvent(event=Tick(ahead=False) as tick):
                 ticks_ns.append(tick.timestamp_ns)
-            case RecordedEvent(event=Command() as command):
-                commands.append(command)
+            case RecordedEvent(event=Command()):
+                commands.append(item)
             case RecordedEvent(event=CameraSample() | ImuSample() as sample):
                 samples.append(sample)
-    times_ns = _times_ns(recording, ticks_ns, setup.session.settings.rate_hz)
-    session = _with_people(setup.session, commands)
-    if any(command.kind is CommandKind.TPOSE for command in commands):
-        session = _with_mountings(session, _mountings(recording, progress))
-    return replace(setup, session=session), samples, times_ns
+    times_ns = instants_ns(recording, ticks_ns, setup.session.settings.rate_hz)
+    return after_commands(recording, setup, commands, progress), samples, times_ns
 
 
-def _times_ns(recording: Recording, ticks_ns: list[int], rate_hz: float) -> list[int]:
-    """The run's own instants, those that it left out filled in."""
+def instants_ns(recording: Recording, ticks_ns: Sequence[int], rate_hz: float) -> list[int]:
+    """The run's own instants, those that it left out filled in; raises `InputError` without any."""
     if not ticks_ns:
         raise InputError(
             f"{recording.path} holds no solved instant: it was cut off within the first moments, "
@@ -149,6 +133,23 @@ def _times_ns(recording: Recording, ticks_ns: list[int], rate_hz: float) -> list
     return [round(instant * 1e9 / rate_hz) for instant in range(first, last + 1)]
 
 
+def after_commands(
+    recording: Recording,
+    setup: SessionSetup,
+    commands: Sequence[RecordedEvent],
+    progress: Progress | None,
+) -> SessionSetup:
+    """With who was added in the run, and how sensors sat in the end."""
+    asked = [(item.number, item.event) for item in commands if isinstance(item.event, Command)]
+    session = _with_people(setup.session, [command for _, command in asked])
+    tposes = [number for number, command in asked if command.kind is CommandKind.TPOSE]
+    if tposes:
+        again = Replay(Recording(recording.path))
+        deque(again.steps(progress, last=tposes[-1]), maxlen=0)
+        session = _with_mountings(session, again.engine.mountings)
+    return replace(setup, session=session)
+
+
 def _with_people(session: Session, commands: Sequence[Command]) -> Session:
     """The session with everyone who was added in the run."""
     added = [c.subject for c in commands if c.kind is CommandKind.ADD_SUBJECT]
@@ -160,15 +161,6 @@ def _with_people(session: Session, commands: Sequence[Command]) -> Session:
     )
     subjects = (*session.subjects, *(SubjectSettings(name=name) for name in new))
     return session.model_copy(update={"settings": settings, "subjects": subjects})
-
-
-def _mountings(
-    recording: Recording, progress: Progress | None
-) -> Mapping[tuple[str, str], np.ndarray]:
-    """How the sensors sat at the end of the run, by subject and bone."""
-    again = Replay(recording)
-    deque(again.steps(progress), maxlen=0)
-    return again.engine.mountings
 
 
 def _with_mountings(session: Session, mountings: Mapping[tuple[str, str], np.ndarray]) -> Session:

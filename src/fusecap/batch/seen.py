@@ -7,7 +7,7 @@ the solve thought. Detections that belong to nobody of the take are counted as o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,12 +17,14 @@ from fusecap.batch.solve import Instants
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.body.pose import landmarks_in_world
 from fusecap.errors import TakeError
+from fusecap.exports.take_format import AnyTake
 from fusecap.geometry.camera import Camera
 from fusecap.geometry.quaternions import from_wxyz
 from fusecap.geometry.same_people import same_people
 from fusecap.progress import Progress
 from fusecap.setup import Setup
 from fusecap.take import Take
+from fusecap.types import Detections, ImuReading
 
 GATE_EXTENTS = 0.15
 """Mean distance of keypoints, as a share of a person's extent in the picture, up to which a
@@ -61,34 +63,46 @@ class Seen:
 
 
 def look_back(
-    take: Take, setup: Setup, instants: Instants, progress: Progress | None = None
+    take: AnyTake,
+    setup: Setup,
+    instants: Instants,
+    progress: Progress | None = None,
 ) -> Seen:
     """Pairs a take with inputs on the same clock; raises `TakeError` where they share no instant.
 
     Also where the take has another skeleton than the inputs' session asks for.
     """
-    if take.bone_names != setup.skeleton.bone_names:
+    if take.skeleton.bone_names != setup.skeleton.bone_names:
         raise TakeError(
-            f"the take has skeleton '{take.skeleton_name}', its session asks for "
+            f"the take has skeleton '{take.skeleton.name}', its session asks for "
             f"'{setup.skeleton.name}'; solve it again"
         )
     every = max(1, -(-len(instants) // MOST_INSTANTS))
     looked = range(0, len(instants), every)
-    found = [instants.detections(instant) for instant in looked]
-    rows = frames_at(take, np.array([each.timestamp_ns for each in found], dtype=np.int64))
+    found: list[Detections] = []
+    readings: list[Mapping[str, ImuReading]] = []
+    for instant in looked:
+        found.append(instants.detections(instant))
+        readings.append(instants.readings(instant))
+        if progress is not None:
+            progress("reading what was measured", len(found), len(looked))
+    times_ns = np.array([each.timestamp_ns for each in found], dtype=np.int64)
+    rows = frames_at(take, times_ns)
     kept = np.flatnonzero(rows >= 0)
     if not len(kept):
         raise TakeError("the take and its session share no instant; are they of one recording?")
     frames = rows[kept]
+    known, at = np.unique(frames, return_inverse=True)
+    part = take.at_frames(known)
     people, cameras = len(take.subject_names), setup.rig.cameras
-    pixels = posed_keypoints(take, setup.landmarks, cameras, frames)
+    pixels = posed_keypoints(part, setup.landmarks, cameras, at)
     keypoints = np.zeros((people, len(cameras), len(frames)), dtype=np.int64)
     residual_px = np.full(keypoints.shape, np.nan)
     others = np.zeros((len(cameras), len(frames)), dtype=np.int64)
     spread: list[list[np.ndarray]] = [[] for _ in cameras]
-    for column, at in enumerate(kept):
+    for column, instant in enumerate(kept):
         for row in range(len(cameras)):
-            detected = found[at].people[row]
+            detected = found[instant].people[row]
             there = pixels[row, :, column]
             subjects, persons = paired(there, detected)
             others[row, column] = len(detected) - len(persons)
@@ -111,11 +125,11 @@ def look_back(
         reprojection_px={
             camera.name: _summary(parts) for camera, parts in zip(cameras, spread, strict=True)
         },
-        sensors=_sensors(take, setup, instants, frames, [looked[at] for at in kept]),
+        sensors=_sensors(part, setup, at, [readings[instant] for instant in kept]),
     )
 
 
-def frames_at(take: Take, times_ns: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+def frames_at(take: AnyTake, times_ns: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
     """The take's frame at each time, -1 where none is within half a period."""
     known_ns = take.timestamps_ns
     if not len(known_ns):
@@ -162,13 +176,15 @@ def paired(
 
 
 def _sensors(
-    take: Take, setup: Setup, instants: Instants, frames: Int[np.ndarray, " n"], at: list[int]
+    take: Take,
+    setup: Setup,
+    frames: Int[np.ndarray, " n"],
+    readings: Sequence[Mapping[str, ImuReading]],
 ) -> tuple[SensorSeen, ...]:
     worn = [model for model in setup.subjects if model.name in take.subject_names]
     worn = [model for model in worn if model.sites.bone]
     if not worn:
         return ()
-    readings = [instants.readings(instant) for instant in at]
     sensors: list[SensorSeen] = []
     for model in worn:
         count = len(model.sites.bone)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from fusecap.batch.second_solve import recorded_inputs
 from fusecap.batch.solve import Instants, SessionInstants
+from fusecap.batch.stored_instants import StoredInstants
 from fusecap.checks import check_measurements
 from fusecap.errors import FusecapError
 from fusecap.findings import Finding
@@ -34,7 +34,12 @@ class SolvedInputs:
 
 
 def inputs_beside(path: Path, take: Take | StoredTake) -> tuple[Path | None, str]:
-    """The session or recording in a take's folder that it was solved from, or why there is none."""
+    """The session or recording in a take's folder that it was solved from, or why there is none.
+
+    A recording has its samples in itself.
+    """
+    if path.suffix == SUFFIX:
+        return path, ""
     expected = take.provenance.get("session_sha256")
     if not expected:
         return None, "the take does not say what it was solved from; name it with --session"
@@ -61,8 +66,8 @@ def open_solved_inputs(path: Path, progress: Progress | None = None) -> SolvedIn
     """A session (its file or folder) or a recording (.mcap); raises `InputError`."""
     if path.suffix == SUFFIX:
         recording = Recording(path)
-        setup, instants = recorded_inputs(recording, progress)
-        return SolvedInputs(setup=setup, instants=instants, sha256=recording.sha256())
+        instants = StoredInstants(recording, progress)
+        return SolvedInputs(setup=instants.setup, instants=instants, sha256=recording.sha256())
     data = open_session(load_session(path), progress)
     checked = check_measurements(data.session, data.rig, data.keypoints, data.samples, data.times_s)
     return SolvedInputs(

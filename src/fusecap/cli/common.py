@@ -21,6 +21,7 @@ from fusecap.files import plain
 if TYPE_CHECKING:
     from fusecap.batch.solve import Solved
     from fusecap.exports.take_format import AnyTake, ExportOptions
+    from fusecap.progress import Progress
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object for machines.")]
 Unit = Annotated[
@@ -148,7 +149,7 @@ def write_take(solved: Solved, path: Path, exports: Exports, *, picture: bool) -
 
 
 @contextmanager
-def opened_take(path: Path) -> Iterator[AnyTake]:
+def opened_take(path: Path, progress: Progress | None = None) -> Iterator[AnyTake]:
     """A take, which is checked and stays in its file, or the poses of a recording as sent."""
     from fusecap.recording.layout import SUFFIX
     from fusecap.stored_take import StoredTake
@@ -156,7 +157,7 @@ def opened_take(path: Path) -> Iterator[AnyTake]:
     if path.suffix == SUFFIX:
         from fusecap.batch.replay import open_take
 
-        yield open_take(path)
+        yield open_take(path, progress)
     else:
         with StoredTake(path) as take:
             take.check()

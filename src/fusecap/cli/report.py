@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from fusecap.cli.common import Json, print_json
+from fusecap.cli.common import Json, opened_take, print_json
 from fusecap.cli.many import (
     Again,
     OnRay,
@@ -92,7 +92,6 @@ def _target(take: Path) -> Path:
 
 
 def _report_of(take: Path, session: Path | None, out: Path | None, *, as_json: bool) -> None:
-    from fusecap.batch.replay import open_take
     from fusecap.batch.report_page import report_page
     from fusecap.batch.seen import look_back
     from fusecap.batch.solved_inputs import inputs_beside, open_solved_inputs
@@ -105,8 +104,7 @@ def _report_of(take: Path, session: Path | None, out: Path | None, *, as_json: b
     check_writable(target)
     notes: list[str] = []
     seen, findings = None, ()
-    with progress(quiet=as_json) as show:
-        opened = open_take(take, show)
+    with progress(quiet=as_json) as show, opened_take(take, show) as opened:
         if not len(opened.timestamps_ns):
             raise TakeError(f"{take}: the take has no frame: nothing to report; solve it again")
         if session is None:
@@ -114,11 +112,13 @@ def _report_of(take: Path, session: Path | None, out: Path | None, *, as_json: b
             notes += [f"without cameras and sensors: {why}"] if session is None else []
         if session is not None:
             inputs = open_solved_inputs(session, show)
-            if inputs.sha256 != opened.provenance.get("session_sha256"):
+            if session != take and inputs.sha256 != opened.provenance.get("session_sha256"):
                 notes.append(f"{session} is not, or no longer, what the take was solved from")
             seen = look_back(opened, inputs.setup, inputs.instants, show)
             findings = inputs.findings
-    page = report_page(opened, take.stem, seen=seen, findings=findings, notes=notes)
+            del inputs  # before the whole take comes
+        whole = opened.of_frames(0, len(opened.timestamps_ns))
+    page = report_page(whole, take.stem, seen=seen, findings=findings, notes=notes)
     write_whole(target, page)
     list_made(take, [target])
     if as_json:

@@ -1,14 +1,14 @@
-"""Where a recording's poses and keypoints are, so that those of one instant can be read alone.
+"""Where a recording's poses and samples are, so that those of one instant can be read alone.
 
-A finished recording tells it at its end; of another one all is unpacked once. 24 bytes are kept of
-a message.
+A finished recording tells it of poses and keypoints at its end; of another one, and where all
+events are wanted, all is unpacked once. 24 bytes are kept of a message.
 """
 
 from __future__ import annotations
 
 import struct
 from array import array
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -61,24 +61,32 @@ class RecordingIndex:
     """
 
     def __init__(
-        self, recording: Recording, *, keypoints_hz: float = 0.0, progress: Progress | None = None
+        self,
+        recording: Recording,
+        *,
+        keypoints_hz: float = 0.0,
+        events: bool = False,
+        progress: Progress | None = None,
     ) -> None:
-        """Keypoints of each camera up to so often."""
+        """Keypoints of each camera up to so often, or all `events`."""
         self.poses: dict[str, Places] = {}
         """By name, in the order of their first appearance."""
         self.keypoints: dict[str, Places] = {}
         """By topic."""
+        self.events: dict[str, Places] = {}
+        """By topic: samples, ticks and commands."""
         self.bodies: dict[str, BodyShape] = {}
         """The last of each person."""
         self._recording = recording
-        self._keypoints_hz = keypoints_hz
+        self._keypoints_hz, self._all_events = keypoints_hz, events
+        wanted = INDEXED if not events else (POSE, BODY, *EVENTS)
         self._unpacked = lru_cache(_RECORDS_KEPT)(recording.unpacked)
         bodies: dict[str, Places] = {}
-        told = told_by(recording.path)
+        told = None if events else told_by(recording.path)
         if told is None:
             numbers = EventNumbers()
             for some in recording.messages(progress, numbers):
-                for topic in _topics(some, numbers):
+                for topic in _topics(some, numbers, wanted):
                     self._add(topic, bodies)
             recording.loss.missing_events = numbers.missing
         else:
@@ -105,6 +113,8 @@ class RecordingIndex:
             places = self.poses.setdefault(topic.name.removeprefix("/pose/"), Places(POSE))
         elif topic.schema == BODY:
             places = bodies.setdefault(topic.name, Places(BODY))
+        elif self._all_events:
+            places = self.events.setdefault(topic.name, Places(topic.schema))
         elif self._keypoints_hz:
             places = self.keypoints.setdefault(topic.name, Places(KEYPOINTS))
             kept = _apart(times_ns, 1e9 / self._keypoints_hz, places.times_ns[-1:])
@@ -140,15 +150,15 @@ class RecordingIndex:
         )
 
 
-def _topics(some: Messages, numbers: EventNumbers) -> list[Topic]:
-    """Those of `INDEXED` schemas, in the order of their first message; `numbers` takes events'."""
+def _topics(some: Messages, numbers: EventNumbers, schemas: Collection[str]) -> list[Topic]:
+    """Those of these schemas, in the order of their first message; `numbers` takes events'."""
     channels, first, which = np.unique(some.channel, return_index=True, return_inverse=True)
     names = [some.names.get(channel, ("", "")) for channel in channels.tolist()]
     is_event = np.array([schema in EVENTS for schema, _ in names], dtype=bool)
     numbers.take_all(some.sequence[is_event[which]])
     topics: dict[tuple[str, str], list[int]] = {}
     for index in np.argsort(first).tolist():
-        if names[index][0] in INDEXED:
+        if names[index][0] in schemas:
             topics.setdefault(names[index], []).append(index)
     found = []
     for (schema, name), indices in topics.items():
