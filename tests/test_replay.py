@@ -237,6 +237,7 @@ def test_what_is_made_from_a_recording_and_from_its_take_stands_side_by_side(rec
         assert {file: file.read_bytes() for file in before} == before
         made[source] = {file.name for file in tmp_path.iterdir()} - {file.name for file in before}
     assert made[path] == {f"run.live{end}" for end in MADE}
+    assert "<h2>Cameras</h2>" in (tmp_path / "run.live_report.html").read_text()
     assert made[take] == {f"run{end}" for end in MADE}
     result = CliRunner().invoke(app, ["solve", str(path), "--as-live", "--out", str(take)])
     assert result.exit_code == 0, result.output
