@@ -18,7 +18,9 @@ from fusecap.angles.gait import gait_cycles
 from fusecap.angles.joint_angles import ANY_ANGLE_SD_DEG, joint_angles
 from fusecap.angles.joints import JOINTS
 from fusecap.body.skeleton import EXTENDED23, PAPER21
+from fusecap.checks.keypoints import UNMEASURED
 from fusecap.cli import app
+from fusecap.edits.edit import EditOptions, edit_take
 from fusecap.errors import InputError, TakeError
 from fusecap.feet import floor_velocity, foot_events
 from fusecap.take import save_take
@@ -324,6 +326,18 @@ def test_the_command_writes_table_mot_and_pictures(tmp_path):
     columns = lines[end + 1].split("\t")
     assert columns[0] == "time" and f"nColumns={len(columns)}" in lines[:end]
     assert {len(line.split("\t")) for line in lines[end + 1 :]} == {len(columns)}
+
+
+def test_limbs_that_nothing_measured_are_told_with_their_angles(tmp_path):
+    text = f"cameras: none sees left_knee of anybody; {UNMEASURED}: leave their angles out"
+    report = {"notes": ["a sensor slept", text]}
+    take = replace(two_walkers(), provenance={"report": report})
+    save_take(take, tmp_path / "duo.npz")
+    save_take(edit_take(take, EditOptions(start_s=0.1)), tmp_path / "short.npz")
+    for name in ("duo.npz", "short.npz"):
+        result = fusecap_angles(tmp_path / name, "--json")
+        assert json.loads(result.stdout)["notes"] == [text]
+        assert "none sees left_knee" in result.stderr and "slept" not in result.stderr
 
 
 def test_one_frame_is_enough_and_nobody_is_an_error(tmp_path):

@@ -14,6 +14,7 @@ from fusecap.body.landmarks import landmark_set_named
 from fusecap.body.pose import forward_kinematics, landmarks_in_world
 from fusecap.body.shape import BodyShape
 from fusecap.body.skeleton import PAPER21
+from fusecap.checks.keypoints import UNMEASURED
 from fusecap.checks.people import _check_stature, _check_upright
 from fusecap.cli import app
 from fusecap.doctor import diagnose
@@ -178,7 +179,7 @@ def test_limbs_that_nothing_measures_are_told(tmp_path, worn):
             for side in ("left", "right")
         ]
         path.write_text(f'{path.read_text()}\n[[subject]]\nname = "a"\n{"".join(tables)}')
-    told = [text for text in said(path) if "leave their angles out" in text]
+    told = [text for text in said(path) if UNMEASURED in text]
     assert [", ".join(ends) in text for text in told] == ([] if worn else [True])
 
 

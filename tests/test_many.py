@@ -171,6 +171,10 @@ def test_doctor_of_many_fails_for_errors_it_finds(tmp_path, in_one_process):
     result = run("doctor", tmp_path / "a", tmp_path / "b", "--json")
     assert result.exit_code == 1
     assert json.loads(result.stdout)["failed"] == 2
+    lines = run("doctor", tmp_path / "a", tmp_path / "b").stdout.splitlines()
+    for name in ("a", "b"):
+        (told,) = (line for line in lines if line.startswith(f"{tmp_path / name}: error"))
+        assert "found 3, expected text" in told
 
 
 def test_a_file_that_is_missing_is_not_newer(tmp_path):

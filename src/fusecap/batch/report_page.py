@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
 from fusecap.batch.seen import Seen
-from fusecap.edits.edit import SOLVE_REPORT
+from fusecap.edits.edit import SOLVE_REPORT, solve_notes, solve_report
 from fusecap.feet import foot_events, on_floor
 from fusecap.findings import Finding
 from fusecap.take import Take
@@ -50,8 +50,7 @@ def report_page(
     notes: Sequence[str] = (),
 ) -> str:
     """The whole page; `notes` say what is missing in it and why."""
-    solve = take.provenance.get("report", take.provenance.get(SOLVE_REPORT))
-    solve = solve if isinstance(solve, Mapping) else {}
+    solve = solve_report(take)
     with matplotlib.rc_context({"svg.fonttype": "none", "text.parse_math": False}):
         parts = [
             *_head(take, title, notes),
@@ -62,7 +61,7 @@ def report_page(
             *_sensors(take, seen),
             *_contacts(take),
             *_solve(take, solve),
-            *_findings(findings, solve),
+            *_findings(findings, solve_notes(take)),
         ]
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
@@ -310,9 +309,7 @@ def _solve(take: Take, solve: Mapping[str, Any]) -> Iterable[str]:
         )
 
 
-def _findings(findings: Sequence[Finding], solve: Mapping[str, Any]) -> Iterable[str]:
-    notes = solve.get("notes")
-    notes = [str(note) for note in notes] if isinstance(notes, list) else []
+def _findings(findings: Sequence[Finding], notes: Sequence[str]) -> Iterable[str]:
     if notes:
         yield "<h2>Notes of the solve</h2>"
         yield f"<ul>{''.join(f'<li>{html.escape(note)}</li>' for note in notes)}</ul>"

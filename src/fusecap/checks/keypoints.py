@@ -14,6 +14,8 @@ from fusecap.sources.session import Session
 
 LOW_COVERAGE = 0.1
 _UNSEEN = 0.02
+UNMEASURED = "what these limbs do is a guess"
+"""By which the note of such limbs is known."""
 _ENDS = {"elbow": "upper_arm", "wrist": "forearm", "knee": "thigh", "ankle": "shank"}
 """Landmarks without which nothing tells of a bone, unless a sensor does."""
 

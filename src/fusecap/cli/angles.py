@@ -107,6 +107,8 @@ def _angles_of(
     from fusecap.angles.gait import gait_cycles
     from fusecap.angles.joint_angles import joint_angles
     from fusecap.batch.replay import open_take
+    from fusecap.checks.keypoints import UNMEASURED
+    from fusecap.edits.edit import solve_notes
     from fusecap.exports import angle_files
     from fusecap.exports.made_files import list_made
     from fusecap.files import distinct_names
@@ -157,12 +159,19 @@ def _angles_of(
                 if not len(each.deg):
                     note(f"'{name}' has no gait cycle of the {each.side} foot: {each.why_none}")
     list_made(take, files)
+    unmeasured = [text for text in solve_notes(opened) if UNMEASURED in text]
+    for text in unmeasured:
+        note(text)
     summary = {
         found.subject_names[row]: _summary(found.names, found.deg[row], found.sd_deg[row])
         for row in people
     }
     if as_json:
-        result: dict[str, Any] = {"files": [str(path) for path in files], "people": summary}
+        result: dict[str, Any] = {
+            "files": [str(path) for path in files],
+            "people": summary,
+            "notes": unmeasured,
+        }
         print_json(result | ({"gait_cycles": cycles} if gait else {}))
         return
     for name, rows in summary.items():

@@ -38,8 +38,9 @@ def doctor(
         "doctor",
         matching(session, wanted=is_session, what="session or recording"),
         {},
-        columns=("errors", "warnings", "first of them"),
+        columns=("errors", "warnings"),
         row=_row,
+        lines=_lines,
         workers=workers,
         ray=ray,
         again=True,
@@ -49,10 +50,15 @@ def doctor(
 
 
 def _row(result: dict[str, Any]) -> list[str]:
-    serious = [each for each in result["findings"] if each["severity"] != "info"]
-    first = f"{serious[0]['where']}: {serious[0]['found']}" if serious else ""
-    warnings = sum(each["severity"] == "warning" for each in serious)
-    return [str(result["errors"]), str(warnings), first]
+    return [str(result["errors"]), str(len(_serious(result)) - result["errors"])]
+
+
+def _lines(result: dict[str, Any]) -> list[str]:
+    return [f"{each['severity']} {each['where']}: {each['found']}" for each in _serious(result)]
+
+
+def _serious(result: dict[str, Any]) -> list[dict[str, Any]]:
+    return [each for each in result["findings"] if each["severity"] != "info"]
 
 
 def _diagnose_one(session: Path, *, as_json: bool) -> None:

@@ -142,11 +142,13 @@ def run_many(
     ray: str | None,
     again: bool,
     as_json: bool,
+    lines: Row = lambda _: (),
     fails: Callable[[dict[str, Any]], bool] = lambda _: False,
 ) -> None:
     """All of them, then a table; exits with 1 where any failed, with 130 where it was interrupted.
 
-    `fails`: a result that counts as a failure although it is one.
+    `lines`: what is said of one under the table. `fails`: a result that counts as a failure
+    although it is one.
     """
     from fusecap.evaluate.runner import compute
 
@@ -176,7 +178,7 @@ def run_many(
         counts = {"paths": len(jobs), "ended": len(ended), "already": already}
         print_json({**counts, "failed": len(failed), "interrupted": interrupted} | {"of": results})
     else:
-        _print_table(jobs, ended, failed, columns, row)
+        _print_table(jobs, ended, failed, columns, row, lines)
         done = len(ended) - len(failed)
         console.print(f"{done} of {len(jobs)} done ({already} already), {len(failed)} failed")
     if interrupted:
@@ -192,17 +194,24 @@ def _print_table(
     failed: Sequence[str],
     columns: Sequence[str],
     row: Row,
+    lines: Row,
 ) -> None:
-    """Failures last, where they are seen; errors as lines of their own, which no column narrows."""
+    """Failures last, where they are seen; what is said as lines, which no column narrows."""
     well = [path for path in jobs if path in ended and path not in set(failed)]
     errors = [path for path in failed if "error" in ended[path]]
+    shown = [
+        *(well if len(ended) <= _SHOWN else ()),
+        *(path for path in failed if "error" not in ended[path]),
+    ]
     table = table_of("", *columns, "s", "")
-    for path in (*(well if len(ended) <= _SHOWN else ()), *failed):
+    for path in shown:
         result = ended[path]
-        if "error" not in result:
-            word = "already" if result.get("already") else ""
-            table.add_row(path, *row(result), f"{result['seconds']:.1f}", word)
-    if table.row_count:
+        word = "already" if result.get("already") else ""
+        table.add_row(path, *row(result), f"{result['seconds']:.1f}", word)
+    if shown:
         console.print(table)
+    for path in shown:
+        for line in lines(ended[path]):
+            console.print(f"{path}: {line}", soft_wrap=True)
     for path in errors:
         console.print(f"failed {path}: {ended[path]['error'].splitlines()[0]}", soft_wrap=True)

@@ -18,6 +18,18 @@ SOLVE_REPORT = "report_before_edits"
 """Where an edited take's provenance has the report of its solve: people and frames were others."""
 
 
+def solve_report(take: Take) -> Mapping[str, Any]:
+    """What the solve said of itself, also before edits; nothing where a take does not tell it."""
+    report = take.provenance.get("report", take.provenance.get(SOLVE_REPORT))
+    return report if isinstance(report, Mapping) else {}
+
+
+def solve_notes(take: Take) -> list[str]:
+    """The notes in it."""
+    notes = solve_report(take).get("notes")
+    return [str(note) for note in notes] if isinstance(notes, list) else []
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EditOptions:
     """What is done to a take, from top to bottom; what is not set is not done."""
