@@ -325,3 +325,40 @@ def test_whoever_is_found_late_may_have_walked_away_from_the_start(simulation, b
     newcomer = standing_at(simulation, 1, x_m, born_s, born_s + 2.0)
     cast.admit([newcomer], newcomer.seen_ns, ToldVote({}))
     assert bool(cast.followed()) == found
+
+
+def test_of_two_wearers_whom_nobody_follows_neither_takes_a_track_that_fits_both(simulation):
+    cast = cast_of(simulation, "x", "y", max_subjects=3)
+    body = standing_at(simulation, 1, 0.0, 0.0, 1.0)
+    cast.add("z")
+    cast.admit([body], 10**9, ToldVote({(1, "z"): 0.05, (1, "x"): 0.9, (1, "y"): 0.9}))
+    assert dict(cast.followed()) == {"z": body}
+    told = ToldVote({(1, "x"): 0.10, (1, "y"): 0.11})
+    assert not cast.pair_anew([body], told, 10**9)
+    assert cast.pair_anew([body], ToldVote({(1, "x"): 0.10, (1, "y"): 0.5}), 10**9)
+    assert dict(cast.followed()) == {"x": body}
+
+
+def test_a_name_of_which_nothing_else_is_known_waits_for_those_who_are_known(simulation):
+    cast = cast_of(simulation, "bob", "x", max_subjects=2)
+    bob, other = (standing_at(simulation, n, 3.0 * n, 0.0, 1.0) for n in range(2))
+    cast.admit([bob, other], 10**9, ToldVote({}))
+    cast.pair_anew([bob, other], ToldVote({(1, "x"): 0.9, (0, "x"): 0.05}), 10**9)
+    assert dict(cast.followed()) == {"bob": other, "x": bob}
+
+
+def test_a_lost_packet_lets_nobody_else_decide():
+    landmarks, bones = landmark_set_named("body25"), IMUS_6
+    vote = SensorVote(landmarks, {"anna": bones})
+    reading = ImuReading(
+        bone_rotation_in_world=np.tile(np.eye(3), (len(bones), 1, 1)),
+        accel_in_world_m_s2=np.zeros((len(bones), 3)),
+    )
+    nobody = np.zeros((0, 25, 3))
+    assert not vote.lately
+    vote.hear([], nobody, {"anna": reading}, 0.1)
+    vote.hear([], nobody, {}, 0.1)
+    assert not vote.heard and vote.lately == {"anna"}
+    for _ in range(30):
+        vote.hear([], nobody, {}, 0.1)
+    assert not vote.lately

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from fusecap.associate import sizes
+from fusecap.associate.looks import CLOTHES, looks
 from fusecap.associate.track import Track
 from fusecap.associate.traits import DOUBT_S, NEAR_M, doubt, exchange, exchanged
 
@@ -73,3 +74,51 @@ def test_a_third_body_is_not_made_one_of_the_two():
     scene.lengths_m = [1.3 * LIMBS, LIMBS]
     scene.go_on(60)
     assert not scene.moves()
+
+
+def test_two_who_return_under_each_others_names_have_done_so_since_they_returned():
+    scene = Scene(LIMBS, 1.09 * LIMBS)
+    scene.go_on(60)
+    before = [track.traits for track in scene.tracks]
+    scene.now_ns += 10**10
+    scene.tracks = [Track(n, np.zeros((25, 3)), np.zeros(3), LIMBS, scene.now_ns) for n in (3, 4)]
+    returned_ns = scene.now_ns
+    scene.go_on(10, crossed=True)
+    for track, known in zip(scene.tracks, before, strict=True):
+        track.continues(known, returned_ns)
+    scene.go_on(10, crossed=True)
+    assert not scene.moves()
+    scene.go_on(20, crossed=True)
+    first, second = scene.tracks
+    assert scene.moves() == {first: second, second: first}
+    assert {track.traits[sizes.NAME].alone_ns for track in scene.tracks} == {returned_ns}
+
+
+def test_sizes_move_nobody_whose_clothes_are_as_before():
+    scene = Scene(LIMBS, 1.09 * LIMBS)
+    red, blue = np.zeros((2, *looks(1).known.shape))
+    red[..., [0, -1]], blue[..., [5, -1]] = 1.0, 1.0
+
+    def wear():
+        for track, colour in zip(scene.tracks, (red, blue), strict=True):
+            for _ in range(30):
+                track.traits[CLOTHES.name].learn(colour)
+
+    for track in scene.tracks:
+        track.traits[CLOTHES.name] = looks(1)
+    scene.go_on(60)
+    wear()
+    scene.go_on(10, apart_m=0.5 * NEAR_M)
+    scene.go_on(40, crossed=True)
+    wear()
+    assert not exchanged(CLOTHES, scene.tracks, scene.now_ns)
+    assert not scene.moves()
+
+
+def test_what_was_not_in_doubt_does_not_move_with_the_names():
+    scene = Scene(LIMBS, 1.09 * LIMBS)
+    scene.go_on(60)
+    first, second = scene.tracks
+    known = first.traits[sizes.NAME].known.copy()
+    exchange({first: second, second: first})
+    assert np.array_equal(first.traits[sizes.NAME].known, known)

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from fusecap.appearance import PART_SIZE, PARTS, by_part, difference
+from fusecap.associate import sizes
 from fusecap.associate.track import Track
 from fusecap.associate.traits import Kind, Trait, telling
 
@@ -53,7 +54,7 @@ def differences(new: Sequence[Trait], old: Sequence[Trait]) -> Float[np.ndarray,
     return np.where(enough, mean.sum(axis=2) / np.maximum(weight.sum(axis=2), 1e-9), np.nan)
 
 
-CLOTHES = Kind(NAME, SAME, OTHER, MARGIN, ENOUGH_TO_MOVE, differences)
+CLOTHES = Kind(NAME, SAME, OTHER, MARGIN, ENOUGH_TO_MOVE, differences, settles=(sizes.NAME,))
 
 
 def learn(

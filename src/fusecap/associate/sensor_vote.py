@@ -27,6 +27,8 @@ SPAN_S = 0.5
 """Of the mean."""
 SOON_S, SURE_S = 0.25, 0.5
 """Heard for so long somebody may be named, and for so long be named anew."""
+LATELY_S = 2.0
+"""Who was heard since is not asked for anything else: a packet may be lost."""
 FITS = 0.25
 """Sensors and limbs of one person are nearer: limbs are off by 41 degrees here."""
 MARGIN = 0.12
@@ -67,6 +69,9 @@ class SensorVote:
                 self._rows[name], self._rest[name] = rows, rest
         self.heard: frozenset[str] = frozenset()
         """Who says something at this instant."""
+        self.lately: frozenset[str] = frozenset()
+        """Who did within the last seconds."""
+        self._quiet_s: dict[str, float] = {}
         self._mean: dict[Track, dict[str, tuple[float, float]]] = {}
         """Per track and wearer: the mean, and for how many seconds it was heard."""
         self._silent_s: dict[Track, float] = {}
@@ -112,6 +117,9 @@ class SensorVote:
                 share = min(elapsed_s / min(heard_s, SPAN_S), 1.0) if heard_s > 0.0 else 1.0
                 self._mean[tracks[t]][name] = (mean + share * (float(away[t]) - mean), heard_s)
         self.heard = frozenset(heard)
+        quiet_s = {name: self._quiet_s.get(name, LATELY_S) + elapsed_s for name in self._rows}
+        self._quiet_s = quiet_s | dict.fromkeys(heard, 0.0)
+        self.lately = frozenset(name for name, quiet in self._quiet_s.items() if quiet < LATELY_S)
 
     def away(
         self, landmarks: Float[np.ndarray, "t k 3"], name: str, reading: ImuReading

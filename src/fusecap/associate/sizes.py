@@ -16,7 +16,7 @@ from fusecap.associate.anatomy import MIN_LIMBS
 from fusecap.associate.track import Track
 from fusecap.associate.traits import Kind, Trait, telling
 
-NAME = "size"
+NAME = "sizes"
 SAME = 0.07
 """Mean relative difference up to which two may be one person."""
 MARGIN = 0.025

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 
 import numpy as np
@@ -175,10 +176,12 @@ class Cast:
         unknown = [t for row, t in enumerate(now) if row not in told]
         cost[:, unknown] = np.inf
         strangers = [t not in [track for _, track in self.followed()] for t in tracks]
-        for row in np.flatnonzero(np.array(now) < 0):
-            # Who is not followed takes somebody's track only if it can be no other; see `admit`.
-            alike = (cost[row] < np.fmin.reduce(cost[row]) + MARGIN).sum() > 1
-            cost[row, np.array(strangers) | alike] = np.inf
+        # Who is not followed takes somebody's track only if it can be no other; see `admit`.
+        lost = np.flatnonzero(np.array(now) < 0)
+        least = np.fmin.reduce(cost[lost], axis=1, initial=np.inf)[:, None]
+        alike = (cost[lost] < least + MARGIN).sum(axis=1) > 1
+        rivals = (cost[lost] < FITS).sum(axis=0) > 1
+        cost[lost] = np.where(alike[:, None] | rivals | np.array(strangers), np.inf, cost[lost])
         nobody = np.full((len(told), len(told)), FITS)
         choice = np.concatenate([np.where(cost < FITS, cost, np.inf)[told], nobody], axis=1)
         best = {told[r]: c if c < len(tracks) else -1 for r, c in cheapest(choice)}
@@ -192,7 +195,11 @@ class Cast:
             return {}
         given = {worn[row].name: tracks[t] for row, t in moves.items() if t >= 0}
         left = [worn[row] for row, t in moves.items() if t < 0]
-        return self._give(given, left, now_ns)
+        known = {p.name: deepcopy(p.track.traits) for p in self._places if p.track}
+        renumbered = self._give(given, left, now_ns)
+        for name, track in given.items():
+            track.continues(known.get(name, {}), now_ns)
+        return renumbered
 
     def part_by(
         self, kind: Kind, tracks: Sequence[Track], now_ns: int, vote: SensorVote
@@ -201,7 +208,7 @@ class Cast:
 
         Returns what `pair_anew` does, and since when it has been so [ns].
         """
-        worn = [p.track for p in self._places if p.live and p.name in vote.heard]
+        worn = [p.track for p in self._places if p.live and p.name in vote.lately]
         seen = [t for t in tracks if t.seen_ns == now_ns and t not in worn]
         moves = exchanged(kind, seen, now_ns)
         if not moves:
@@ -473,6 +480,8 @@ class Cast:
             return np.inf
         expected = self._anatomy.centre(lost.predict(track.born_ns))
         away = np.nan_to_num(np.linalg.norm(track.born_m - expected))
+        if np.isnan(expected).all():
+            return 2.0  # Nothing is known but the name: whoever is known goes first.
         misfit = size_misfit(lost.limb_lengths_m(), track.limb_lengths_m())
         since_s = max(track.born_ns - lost.triangulated_ns, 0) * 1e-9
         reach = o.reach_m + 2 * o.reach_speed_m_s * since_s
@@ -513,8 +522,7 @@ class Cast:
             if place.live:
                 place.track.replaced = True
             track.becomes(place.track, everyone)
-            for name in track.traits.keys() & place.track.traits.keys():
-                track.traits[name].continues(place.track.traits[name])
+            track.continues(place.track.traits, since_ns)
         place.track = track
         place.live = True
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -184,8 +184,14 @@ class Track:
         newcomer.limb_sum_m += self.limb_sum_m
         newcomer.limb_count += self.limb_count
         self.limb_sum_m, self.limb_count = self.limb_sum_m * 0.0, self.limb_count * 0.0
-        self.fork = newcomer.fork = None
+        newcomer.continues(self.traits, newcomer.born_ns)
+        self.traits, self.fork, newcomer.fork = {}, None, None
         self.was_mistaken()
+
+    def continues(self, known: Mapping[str, Trait], since_ns: int) -> None:
+        """Be, since then, whom these traits are of; what was seen of it is held against them."""
+        for name in self.traits.keys() & known.keys():
+            self.traits[name].continues(known[name], since_ns)
 
     def was_mistaken(self) -> None:
         """It followed several people: whom it was measured beside says nothing."""

@@ -71,7 +71,7 @@ class Tracker:
         self._vote = SensorVote(landmark_set, {s.name: s.sensors for s in subjects if s.sensors})
         self._readings: Mapping[str, ImuReading] = {}
         self.renumbered: dict[int, int] = {}
-        """Of tracks that sensors paired anew at the last instant, by the former id the new one."""
+        """Of tracks that at the last instant turned out to be others, by the former id the new."""
         self.renumbered_since_ns: int | None = None
         """When these went astray; None where sensors' readings must tell."""
         self.bystanders: list[TrackUpdate] = []
@@ -125,6 +125,7 @@ class Tracker:
                 for t, track in enumerate(tracks)
                 if track.track_id in subjects and (person[t] < 0).all()
             }
+            free[person[person >= 0]] = False
             if unseen:
                 find_again(self._rig, views, unseen, person, expected, free, self._options, now_ns)
         follow(self._rig, views, tracks, person, expected, now_ns)
@@ -157,7 +158,7 @@ class Tracker:
                 self.renumbered, self.renumbered_since_ns = self._cast.part_by(
                     kind, everyone, now_ns, self._vote
                 )
-                self.notes += self._renumbered_notes(f"their {kind.name} says so")
+                self.notes += self._renumbered_notes(f"{kind.name} say so")
         self.notes += [
             f"{name}: sensors and cameras contradict each other; either nobody who is seen wears "
             "these sensors, or their bones or headings are not as stated (fusecap calibrate imu)"

@@ -56,7 +56,7 @@ class Trait:
         self.fresh = np.zeros(shape)
         self.fresh_count = np.zeros(shape[:2])
         self.doubtful = False
-        self.alone_ns = 0
+        self.alone_ns = -1
         """Since when nobody is near and two views agree, while it is doubtful."""
 
     def doubt(self, now_ns: int) -> None:
@@ -82,13 +82,15 @@ class Trait:
         share = (self.fresh_count / total)[:, :, None]
         self.known += share * (self.fresh - self.known)
         np.minimum(self.known_count + self.fresh_count, self._memory, out=self.known_count)
+        self.fresh[:] = 0.0
+        self.fresh_count[:] = 0.0
         self.doubtful = False
 
-    def continues(self, old: Trait) -> None:
+    def continues(self, old: Trait, since_ns: int) -> None:
         """It turned out to be who was lost; what was seen of it is held against others later."""
         if not self.doubtful:
             self.fresh, self.fresh_count = self.known, self.known_count
-            self.doubtful = True
+            self.doubtful, self.alone_ns = True, since_ns
         self.known, self.known_count = old.known.copy(), old.known_count.copy()
 
     @property
@@ -124,6 +126,8 @@ class Kind(NamedTuple):
     """Sights from which somebody is given another's name."""
     differences: Callable[[Sequence[Trait], Sequence[Trait]], Float[np.ndarray, "n m"]]
     """Of bodies as they are seen now from what is known of people; NaN: too little is known."""
+    settles: tuple[str, ...] = ()
+    """Other traits that are believed where this one is as before."""
 
 
 def doubt(tracks: Sequence[Track], centre_m: Float[np.ndarray, "t 3"], now_ns: int) -> None:
@@ -139,7 +143,7 @@ def doubt(tracks: Sequence[Track], centre_m: Float[np.ndarray, "t 3"], now_ns: i
 def telling(track: Track, kind: str, now_ns: int) -> bool:
     """Whether what is seen of a track now is one person's for sure."""
     trait = track.traits[kind]
-    return track.triangulated_ns == now_ns and not (trait.doubtful and trait.alone_ns == now_ns)
+    return track.triangulated_ns == now_ns and trait.alone_ns != now_ns
 
 
 def exchanged(kind: Kind, tracks: Sequence[Track], now_ns: int) -> dict[Track, Track]:
@@ -166,15 +170,19 @@ def exchanged(kind: Kind, tracks: Sequence[Track], now_ns: int) -> dict[Track, T
         clear = not mine > kind.other and not (others < mine + kind.margin).any()
         if clear or (now_ns - of(track).alone_ns) * 1e-9 > DOUBT_S:
             of(track).believe()
+        if clear and np.isfinite(mine):
+            for name in track.traits.keys() & kind.settles:
+                track.traits[name].believe()
     return {}
 
 
 def exchange(moves: Mapping[Track, Track]) -> None:
-    """What is known goes with the people."""
+    """What is known goes with the people; what was not in doubt is of the body that is there."""
     known = {
-        (track, name): (other.traits[name].known, other.traits[name].known_count)
+        (track, name): (trait.known, trait.known_count)
         for track, other in moves.items()
-        for name in track.traits.keys() & other.traits.keys()
+        for name, trait in other.traits.items()
+        if name in track.traits and trait.doubtful and track.traits[name].doubtful
     }
     for (track, name), (mean, count) in known.items():
         track.traits[name].known, track.traits[name].known_count = mean, count

@@ -44,7 +44,10 @@ def inputs_beside(path: Path, take: Take | StoredTake) -> tuple[Path | None, str
     if not expected:
         return None, "the take does not say what it was solved from; name it with --session"
     told = Path(str(take.provenance.get("recording") or "")).name
-    recording = path.with_name(told or path.stem + SUFFIX)
+    stem = path.stem.removesuffix("-interrupted").removesuffix("-as-live")
+    recording = path.with_name(told) if told else path.with_name(stem + SUFFIX)
+    if not recording.is_file():
+        recording = path.with_name(stem + SUFFIX)
     session = path.with_name(FILE_NAME)
     changed = ""
     try:
