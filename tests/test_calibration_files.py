@@ -7,7 +7,7 @@ import pytest
 
 from fusecap.errors import CalibrationError
 from fusecap.geometry.camera import Y_UP_FROM_Z_UP, Rig
-from fusecap.sources.calibration_files import check_rig, load_rig
+from fusecap.sources.calibration_files import check_rig, load_rig, write_rig
 from session_files import calibration_toml, ring
 
 POINTS = np.array([[0.3, 1.0, 0.2], [-0.2, 0.1, 0.4], [0.0, 1.7, -0.3]])
@@ -111,6 +111,42 @@ def test_broken_calibration_is_refused_with_place(tmp_path, old, new, expected):
 def test_zero_coefficients_beyond_the_fifth_are_accepted(tmp_path):
     text = calibration_toml(ring()).replace("0.0, 0.0, 0.0, 0.0, 0.0]", "0, 0, 0, 0, 0, 0, 0, 0]")
     assert_same_images(load_rig(write(tmp_path / "c.toml", text)), ring())
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "told"),
+    [
+        ("cameraIntrinsicsExtrinsics.pickle", "", "OpenCap's .* intrinsicMat"),
+        ("lens.yml", "%YAML:1.0\nfisheye_model: 1\n", "fisheye"),
+        (
+            "lens.xml",
+            "<opencv_storage><fisheye_model>1</fisheye_model></opencv_storage>",
+            "fisheye",
+        ),
+        ("lens.yaml", "%YAML:1.0\nfisheye_model: 0\n", "not a calibration that is known"),
+    ],
+)
+def test_what_is_known_but_not_read_is_refused_by_name(tmp_path, name, content, told):
+    with pytest.raises(CalibrationError, match=f"(?s){name}.*{told}"):
+        load_rig(write(tmp_path / name, content))
+
+
+def test_fisheye_lenses_beside_easymocaps_extrinsics_are_refused(tmp_path):
+    write(tmp_path / "intri.yml", 'names:\n  - "1"\nfisheye_model: 1\n')
+    write(tmp_path / "extri.yml", "")
+    with pytest.raises(CalibrationError, match=r"intri\.yml.*fisheye"):
+        load_rig(tmp_path)
+
+
+@pytest.mark.parametrize("turned", ["90", "180", "270"])
+def test_turned_cameras_of_qualisys_are_refused_where_the_session_uses_them(tmp_path, turned):
+    path = tmp_path / "c.qca.txt"
+    write_rig(path, ring(2))
+    text = path.read_text().replace('viewrotation="0"', f'viewrotation="{turned}"', 1)
+    write(path, text)
+    with pytest.raises(CalibrationError, match=f"viewrotation {turned}.*unrotated"):
+        load_rig(path)
+    assert load_rig(path, names=["cam1"]).names == ("cam1",)
 
 
 @pytest.mark.parametrize("name", ["c.toml", "c.json", "c.qca.txt", "c.xyz"])

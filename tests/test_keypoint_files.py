@@ -115,6 +115,12 @@ def test_missing_and_empty_folders_are_refused(tmp_path):
         read(tmp_path)
 
 
+def test_tables_of_other_programs_are_refused_with_what_to_do(tmp_path):
+    np.save(tmp_path / "points.npy", np.zeros((10, 33, 2)))
+    with pytest.raises(InputError, match=r"points\.npy: is a file; .* folder .* FreeMoCap's .npy"):
+        read(tmp_path / "points.npy")
+
+
 @pytest.mark.real_data
 def test_shelf_keypoints_read(data_dir, tmp_path):
     with tarfile.open(data_dir / "shelf/openpose_body25.tar.xz") as archive:

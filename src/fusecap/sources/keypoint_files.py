@@ -148,6 +148,12 @@ def frame_number(name: str) -> int | None:
 
 def _numbered_files(folder: Path) -> dict[int, str]:
     """Names by frame number, which rises."""
+    if folder.is_file():
+        raise InputError(
+            f"{folder}: is a file; expected a folder with one keypoint JSON per frame, as OpenPose "
+            "writes them. Tables of another program, such as FreeMoCap's .npy, go in through "
+            "Python (examples/1_own_detections.py)"
+        )
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; expected one keypoint JSON per frame")
     by_frame: dict[int, str] = {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,11 @@ from scipy.spatial.transform import Rotation
 from fusecap.errors import CalibrationError
 from fusecap.geometry.camera import Camera
 from fusecap.inputs import CALIBRATION, read_json
+
+
+def states_fisheye(text: str) -> bool:
+    """Whether a YAML or XML file of OpenCV says that its lenses are fisheye ones."""
+    return re.search(r"fisheye\w*[\s:>=\"']*(1|true)\b", text, re.IGNORECASE) is not None
 
 
 def json_object(path: Path) -> dict[str, Any]:

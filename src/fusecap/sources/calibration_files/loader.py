@@ -10,6 +10,8 @@ import numpy as np
 
 from fusecap.errors import CalibrationError
 from fusecap.geometry.camera import MOST_CAMERAS, Y_UP_FROM_Z_UP, Rig
+from fusecap.inputs import CALIBRATION, read_text
+from fusecap.sources.calibration_files import fields
 from fusecap.sources.calibration_files.formats import rig_formats
 from fusecap.sources.calibration_files.plausibility import MILLIMETRES_ABOVE, camera_spread
 from fusecap.sources.calibration_files.rig_format import StatedCamera
@@ -20,6 +22,7 @@ Y_UP_FROM = {
     "-y": np.diag([1.0, -1.0, -1.0]),
 }
 """Per up axis of a calibration's world, the rotation that brings it into ours."""
+_PICKLES, _OPENCV = (".pickle", ".pkl"), (".yml", ".yaml", ".xml")
 
 
 def load_rig(
@@ -83,6 +86,21 @@ def _known() -> str:
     return "expected " + " or ".join(format.what for format in rig_formats())
 
 
+def _unknown(path: Path) -> CalibrationError:
+    if path.suffix.lower() in _PICKLES:
+        return CalibrationError(
+            f"{path}: a pickle may run any program when it is opened, so none is; OpenCap's "
+            "cameraIntrinsicsExtrinsics.pickle holds intrinsicMat, distortion, imageSize, rotation "
+            f"and translation [mm] of one camera, write those of all into one file: {_known()}"
+        )
+    if path.suffix.lower() in _OPENCV and fields.states_fisheye(read_text(path, CALIBRATION)):
+        return CalibrationError(
+            f"{path} states fisheye lenses: not supported; calibrate with the standard model, or "
+            "undistort the images first"
+        )
+    return CalibrationError(f"{path}: not a calibration that is known; {_known()}")
+
+
 def _read(path: Path) -> tuple[list[StatedCamera], bool]:
     """The cameras, and whether the format leaves their unit open."""
     if not path.exists():
@@ -92,7 +110,7 @@ def _read(path: Path) -> tuple[list[StatedCamera], bool]:
         if cameras is not None:
             return cameras, format.unit_is_open
     if not path.is_dir():
-        raise CalibrationError(f"{path}: not a calibration that is known; {_known()}")
+        raise _unknown(path)
     files = [f for f in sorted(path.iterdir()) if f.is_file() and f.name.endswith(_suffixes())]
     if len(files) != 1:
         found = f"{len(files)} calibration files" if files else "no calibration file"

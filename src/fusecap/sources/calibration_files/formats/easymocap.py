@@ -49,6 +49,11 @@ def read(path: Path) -> list[StatedCamera] | None:
         text = read_text(file, CALIBRATION).replace("\r\n", "\n")
         values |= {key: data.replace(",", " ").split() for key, data in _MATRIX.findall(text)}
         values |= {key: [number] for key, number in _NUMBER.findall(text)}
+        if fields.states_fisheye(text):
+            raise CalibrationError(
+                f"{file} states fisheye lenses: not supported; calibrate with the standard model, "
+                "or undistort the images first"
+            )
         found = _NAMES.search(text)
         if found and not names:
             listed = (line.strip() for line in found.group(1).splitlines() if line.strip())

@@ -106,7 +106,10 @@ def _camera(path: Path, element: ElementTree.Element) -> Camera:
         return float(fields.numbers(attributes.get(key), (1,), f"{where} {key}")[0])
 
     if "fisheye" in element.get("model", "").lower():
-        raise CalibrationError(f"{where} is a fisheye lens, which is not supported")
+        raise CalibrationError(
+            f"{where} is a fisheye lens: not supported; calibrate with the standard model, or "
+            "undistort the images first"
+        )
     left, top = value(view, "left"), value(view, "top")
     size_px = np.array([value(view, "right") - left + 1, value(view, "bottom") - top + 1])
     filmed = _filmed_lines(element) / size_px[1]
