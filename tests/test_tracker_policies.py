@@ -415,3 +415,13 @@ def test_subject_is_remembered_for_a_while_and_for_good_under_a_name(away_s, nam
     ((again, new_id),) = subjects_of(stage.hold(0.5, SOMEBODY)).items()
     assert called == again == (name or "person1")
     assert (new_id == track_id) is remembered
+
+
+def test_whoever_takes_a_bystanders_place_while_nobody_looks_is_not_held_to_be_the_bystander():
+    stage = Stage(Tracker(RIG, BODY25, TrackerOptions(max_subjects=1)))
+    stage.hold(1.0, aside(0.0), aside(1.3))
+    for _ in range(round(3.5 * RATE_HZ)):
+        stage.show(left=len(RIG))
+    stage.hold(4.0, aside(1.3))
+    (found,) = stage.show(aside(1.3))
+    assert (found.name, found.state) == ("person1", TrackState.CONFIRMED)

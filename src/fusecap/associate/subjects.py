@@ -247,7 +247,7 @@ class Cast:
                 place.track, place.live = given[place.name], True
         for track in (*given.values(), *freed):
             track.track_id = renumbered[track.track_id]
-            track.was_mistaken()
+            track.may_be_another()
         return renumbered
 
     def return_to_way(

@@ -186,15 +186,15 @@ class Track:
         self.limb_sum_m, self.limb_count = self.limb_sum_m * 0.0, self.limb_count * 0.0
         newcomer.continues(self.traits, newcomer.born_ns)
         self.traits, self.fork, newcomer.fork = {}, None, None
-        self.was_mistaken()
+        self.may_be_another()
 
     def continues(self, known: Mapping[str, Trait], since_ns: int) -> None:
         """Be, since then, whom these traits are of; what was seen of it is held against them."""
         for name in self.traits.keys() & known.keys():
             self.traits[name].continues(known[name], since_ns)
 
-    def was_mistaken(self) -> None:
-        """It followed several people: whom it was measured beside says nothing."""
+    def may_be_another(self) -> None:
+        """It follows somebody else now, or may: whom it was measured beside says nothing."""
         for other in self.beside:
             other.beside.pop(self, None)
         self.beside = {}

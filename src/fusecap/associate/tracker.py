@@ -291,6 +291,8 @@ class Tracker:
         return now_ns // DECIDE_NS != (self._last_ns or 0) // DECIDE_NS
 
     def _count_frame(self, track: Track, views: int, now_ns: int) -> None:
+        if (now_ns - track.triangulated_ns) * 1e-9 > self._options.doubt_s:
+            track.may_be_another()
         track.triangulated_ns = now_ns
         track.frames += 1
         enough = self._options.birth_views
@@ -335,8 +337,8 @@ class Tracker:
             measured[t] = found[i].landmarks_in_world_m
             track = self._population.tracks[t]
             self._note_jump(track, track.predict(now_ns), measured[t], now_ns)
-            track.restart(measured[t].copy(), now_ns)
             self._count_frame(track, int((person[t] >= 0).sum()), now_ns)
+            track.restart(measured[t].copy(), now_ns)
             taken.add(i)
         for i, candidate in enumerate(found):
             landmarks = candidate.landmarks_in_world_m
