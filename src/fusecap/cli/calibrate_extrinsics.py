@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fusecap.cli import calibrate_from_people
+from fusecap.cli import calibrate_from_people, calibrate_from_points
 from fusecap.cli.calibrate_intrinsics import Every
 from fusecap.cli.calibrations import (
     named_sources,
@@ -71,6 +71,14 @@ def extrinsics(
     ] = None,
     every: Every = None,
     seed: Annotated[int, typer.Option(help="Of the resampled instants.")] = 0,
+    points: Annotated[
+        Path | None,
+        typer.Option(
+            help="CSV of marked points whose places were measured: each camera of --intrinsics is "
+            "placed by the ones it shows; without a board."
+        ),
+    ] = None,
+    up: Annotated[str, typer.Option(help="Up axis of the places of --points: y, z or -y.")] = "y",
     from_people: Annotated[
         Path | None,
         typer.Option(
@@ -95,13 +103,14 @@ def extrinsics(
 ) -> None:
     """Where cameras stand to each other, from a board that several see at the same instants.
 
-    Writes the calibration, a report (.json) and a picture (.png). With --from-people SESSION, a
-    rough calibration is refined instead, from the keypoints of people who walk about.
+    Writes the calibration, a report (.json) and a picture (.png). With --points, from points of the
+    scene instead. With --from-people SESSION, a rough calibration is refined, from the keypoints of
+    people who walk about.
     """
     if from_people is not None:
-        if sources or board is not None:
+        if sources or board is not None or points is not None:
             raise typer.BadParameter(
-                "refines a session; it takes neither sources nor --board",
+                "refines a session; it takes neither sources, --board nor --points",
                 param_hint="--from-people",
             )
         calibrate_from_people.from_people(
@@ -116,6 +125,15 @@ def extrinsics(
         raise typer.BadParameter(
             "goes with --from-people; boards know no session", param_hint="--write"
         )
+    if points is not None:
+        if sources or board is not None:
+            raise typer.BadParameter(
+                "takes marks; leave out sources and --board", param_hint="--points"
+            )
+        calibrate_from_points.from_points(
+            points, intrinsics=intrinsics, up=up, out=out, as_json=as_json
+        )
+        return
     from fusecap.calibrate.cameras.board import read_board
     from fusecap.calibrate.cameras.report import calibrate_rig
     from fusecap.calibrate.pictures import plot_rig

@@ -1,0 +1,149 @@
+"""Cameras placed by points of the scene, as Pose2Sim's users do it, and what goes wrong there."""
+
+import json
+
+import numpy as np
+import pytest
+
+from fusecap.calibrate.cameras.scene_points import place_cameras
+from fusecap.cli import main
+from fusecap.errors import CalibrationError
+from fusecap.geometry.camera import Rig
+from fusecap.sources.calibration_files import load_rig, write_rig
+from fusecap.sources.marked_points import MarkedPoints
+from session_files import ring
+
+TRUE = ring(3)
+ROOM = np.array(
+    [[0, 0, 0], [1.2, 0, 0.1], [-0.3, 0.8, 0.9], [0.5, 1.5, -0.8], [-1, 0.2, -0.6], [0.9, 1, 0.7]]
+)
+FLOOR = np.array([[0, 0, 0], [0.9, 0, 0], [0, 0, 0.9], [0.9, 0, 0.9], [-0.7, 0, 0.4], [0, 0, -1.0]])
+
+
+def marked(places: np.ndarray, told: np.ndarray, noise_px: float = 0.0) -> MarkedPoints:
+    rng = np.random.default_rng(5)
+    pixels = np.stack([camera.project(places) for camera in TRUE.cameras])
+    pixels += noise_px * rng.standard_normal(pixels.shape)
+    return MarkedPoints(
+        names=tuple("abcdef"[: len(places)]),
+        keypoints=np.concatenate([pixels, np.ones((*pixels.shape[:2], 1))], axis=2),
+        in_world_m=told,
+    )
+
+
+@pytest.mark.parametrize("places", [ROOM, FLOOR, FLOOR[:4]], ids=["room", "floor", "four"])
+def test_cameras_stand_where_the_points_say(places):
+    placed, unseen = place_cameras(TRUE.cameras, marked(places, places))
+    assert not unseen
+    for found, true in zip(placed, TRUE.cameras, strict=True):
+        assert np.allclose(found.camera.position_in_world, true.position_in_world, atol=1e-4)
+        assert np.allclose(found.camera.rotation, true.rotation, atol=1e-4)
+        assert found.rms_px < 0.01
+
+
+def test_noise_of_marks_moves_cameras_as_far_as_stated():
+    placed, _ = place_cameras(TRUE.cameras, marked(ROOM, ROOM, noise_px=2.0))
+    off_mm = [
+        1e3 * np.linalg.norm(found.camera.position_in_world - true.position_in_world)
+        for found, true in zip(placed, TRUE.cameras, strict=True)
+    ]
+    stated_mm = [found.place_sd_mm for found in placed]
+    assert 0.3 < np.sqrt(np.mean(np.square(off_mm)) / np.mean(np.square(stated_mm))) < 2
+    assert not any(found.problems for found in placed)
+
+
+def test_a_place_that_was_noted_wrongly_is_named_and_left_out():
+    told = ROOM.copy()
+    told[3, 1] += 0.25
+    placed, _ = place_cameras(TRUE.cameras, marked(ROOM, told, noise_px=1.0))
+    for found, true in zip(placed, TRUE.cameras, strict=True):
+        assert "'d' is" in found.problems[0]
+        assert np.allclose(found.camera.position_in_world, true.position_in_world, atol=0.05)
+
+
+def test_places_of_a_left_handed_system_are_told():
+    placed, _ = place_cameras(TRUE.cameras, marked(ROOM, ROOM * [1, 1, -1]))
+    assert all("left-handed" in found.problems[0] for found in placed)
+
+
+@pytest.mark.parametrize(
+    ("places", "expected"),
+    [
+        (ROOM[:3], "3 points are marked, expected 4"),
+        (ROOM[:1] + np.eye(3)[0] * np.arange(5)[:, None], "on a line"),
+    ],
+)
+def test_what_places_no_camera_is_refused(places, expected):
+    with pytest.raises(CalibrationError, match=expected):
+        place_cameras(TRUE.cameras, marked(places, places))
+
+
+def csv(path, places, told, cameras=TRUE.cameras):
+    head = ["name", "x_m", "y_m", "z_m"] + [f"{c.name}_{a}_px" for c in cameras for a in "uv"]
+    rows = [
+        [name, *told[i], *np.ravel([camera.project(places)[i] for camera in cameras])]
+        for i, name in enumerate("abcdef"[: len(places)])
+    ]
+    path.write_text("\n".join(",".join(map(str, row)) for row in [head, *rows]) + "\n")
+    return path
+
+
+def run(capsys, monkeypatch, *arguments):
+    monkeypatch.setattr("sys.argv", ["fusecap", "calibrate", "extrinsics", *map(str, arguments)])
+    with pytest.raises(SystemExit) as end:
+        main()
+    out = capsys.readouterr()
+    return end.value.code, out.out, out.err
+
+
+def lenses(tmp_path):
+    at_origin = [
+        type(c)(
+            **{k: getattr(c, k) for k in ("name", "size_px", "matrix", "distortion")},
+            rotation=np.eye(3),
+            translation=np.zeros(3),
+        )
+        for c in TRUE.cameras
+    ]
+    path = tmp_path / "lenses.toml"
+    write_rig(path, Rig(cameras=tuple(at_origin)))
+    return path
+
+
+def test_command_places_cameras_of_a_z_up_room(tmp_path, capsys, monkeypatch):
+    z_up = ROOM @ np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]).T
+    marks, out = csv(tmp_path / "marks.csv", ROOM, z_up), tmp_path / "calibration.toml"
+    code, text, _ = run(
+        capsys,
+        monkeypatch,
+        "--points",
+        marks,
+        "--intrinsics",
+        lenses(tmp_path),
+        "--up",
+        "z",
+        "--out",
+        out,
+        "--json",
+    )
+    report = json.loads(text)
+    assert code == 0 and report["verdict"] == "good"
+    for camera in load_rig(out).cameras:
+        assert np.allclose(camera.position_in_world, TRUE[camera.name].position_in_world, atol=1e-4)
+
+
+def test_command_tells_that_the_world_is_upside_down(tmp_path, capsys, monkeypatch):
+    """perfanalytics/pose2sim #192: four points on the floor, one axis with the wrong sign."""
+    told = FLOOR[:4] * [-1, 1, 1]
+    marks, out = csv(tmp_path / "marks.csv", FLOOR[:4], told), tmp_path / "calibration.toml"
+    code, text, errors = run(
+        capsys, monkeypatch, "--points", marks, "--intrinsics", lenses(tmp_path), "--out", out
+    )
+    assert code == 0 and "poor" in text
+    assert "below the floor" in errors and "upside down" in errors
+
+
+@pytest.mark.parametrize("arguments", [["--points", "m.csv"], ["--points", "m.csv", "a=b"]])
+def test_misuse_is_told(tmp_path, capsys, monkeypatch, arguments):
+    code, _, errors = run(capsys, monkeypatch, *arguments)
+    assert code == 2 and "--points" in errors
