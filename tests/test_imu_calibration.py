@@ -392,7 +392,7 @@ def test_tpose_gives_the_mounting_and_doubts_what_moved():
     assert "gravity is 9.0 deg off" in look_at_tpose(subject, imu, tpose_track(9.0)).complaints[0]
     with pytest.raises(SessionError, match="no sample in tpose_s"):
         look_at_tpose(subject.model_copy(update={"tpose_s": (5.0, 6.0)}), imu, tpose_track())
-    with pytest.raises(SessionError, match="has no tpose_s"):
+    with pytest.raises(SessionError, match="tpose_s states when"):
         look_at_tpose(subject.model_copy(update={"tpose_s": None}), imu, tpose_track())
 
 
@@ -516,7 +516,7 @@ def test_misuse_and_missing_inputs_are_told(recording, tmp_path, monkeypatch, ca
     code, _ = run(monkeypatch, capsys, recording, "--optical")
     assert code == 2
     code, said = run(monkeypatch, capsys, recording, "--from", "tpose")
-    assert code == 1 and "has no tpose_s" in said.err
+    assert code == 1 and "tpose_s states when" in said.err
     text = (recording / "session.toml").read_text()
     bare = text.split("[[camera]]")[0] + "[[subject]]" + text.split("[[subject]]", 1)[1]
     path = recording / "bare.toml"

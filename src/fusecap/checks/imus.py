@@ -28,7 +28,11 @@ def check_imus(
             if track is None:
                 continue
             where = f"imu '{imu.bone}' of '{subject.name}'"
-            if imu.bone_from_imu_wxyz is None and subject.tpose_s is None:
+            if (
+                imu.bone_from_imu_wxyz is None
+                and subject.still_s is None
+                and track.bone_from_imu is None
+            ):
                 unmounted.append(imu.bone)
             else:
                 try:
@@ -57,7 +61,7 @@ def _add_unmounted(subject: str, bones: list[str], cameras: bool, findings: Find
         "error",
         f"sensors of '{subject}'",
         f"how they sit on the bones is not known: {', '.join(bones)}",
-        f"{command}state tpose_s = [start, end], when the subject stands in the T-pose",
+        f"{command}state tpose_s = [start, end], when the subject stands in the T-pose, or npose_s",
     )
 
 

@@ -260,6 +260,8 @@ class ImuSettings(_Table):
     offset_s: Number = 0.0
     """Added to the file's times."""
     bone_from_imu_wxyz: Quaternion | None = None
+    static_file: File | None = None
+    """A trial of its own for `tpose_s` or `npose_s`, which count on this file's clock then."""
     position_m: Vector = (0.0, 0.0, 0.0)
     """The sensor in the bone's frame."""
     heading_deg: Number = 0.0
@@ -293,9 +295,24 @@ class SubjectSettings(_Table):
     bone_lengths_m: dict[str, Positive] = Field(default_factory=dict)
     tpose_s: Interval | None = None
     """When the subject stands in the rest pose."""
+    npose_s: Interval | None = None
+    """When it stands so, but with hanging arms, palms to the thighs."""
     tpose_facing_deg: Number = 0.0
     """Where it faces then: 0 is +z, 90 is +x."""
     imus: tuple[ImuSettings, ...] = Field(default=(), alias="imu")
+
+    @model_validator(mode="after")
+    def _stands_in_one_pose(self) -> SubjectSettings:
+        if self.tpose_s is not None and self.npose_s is not None:
+            raise PydanticCustomError(
+                "two_poses", "both tpose_s and npose_s are given; sensors are calibrated in one"
+            )
+        return self
+
+    @property
+    def still_s(self) -> Interval | None:
+        """When it stands in a known pose, whichever."""
+        return self.tpose_s or self.npose_s
 
 
 class WeightSettings(_Table):

@@ -142,7 +142,7 @@ def without_unplaced_sensors(session: Session) -> tuple[Session, list[Finding]]:
         placed = tuple(
             imu
             for imu in subject.imus
-            if imu.bone_from_imu_wxyz is not None or subject.tpose_s is not None
+            if imu.bone_from_imu_wxyz is not None or subject.still_s is not None
         )
         left_out = [imu.bone for imu in subject.imus if imu not in placed]
         subjects.append(subject.model_copy(update={"imus": placed}))
@@ -160,7 +160,7 @@ def without_unplaced_sensors(session: Session) -> tuple[Session, list[Finding]]:
 
 
 def mount(subject: SubjectSettings, tracks: list[ImuTrack]) -> list[MountedImu]:
-    """Sensors with their offsets; `bone_from_imu` from the T-pose where it is not given."""
+    """Sensors with their offsets; `bone_from_imu` as given, by a T- or N-pose, else MVN's."""
     return [
         MountedImu(
             bone=imu.bone,
@@ -173,31 +173,63 @@ def mount(subject: SubjectSettings, tracks: list[ImuTrack]) -> list[MountedImu]:
     ]
 
 
-def _bone_from_imu(subject: SubjectSettings, imu: ImuSettings, track: ImuTrack) -> np.ndarray:
+def still_samples(subject: SubjectSettings, imu: ImuSettings, track: ImuTrack) -> ImuTrack:
+    """The sensor while the subject stands in the T- or N-pose, of the static trial if it has one.
+
+    Raises `SessionError` without an interval or samples in it, `InputError` for a static trial that
+    cannot be read.
+    """
     where = f"imu '{imu.bone}' of '{subject.name}'"
-    if imu.bone_from_imu_wxyz is not None:
-        return from_wxyz(imu.bone_from_imu_wxyz).as_matrix()
-    if subject.tpose_s is None:
+    if subject.still_s is None:
         raise SessionError(
             f"{where}: how it sits on the bone is not known; fusecap calibrate imu finds it from "
-            "motion the cameras saw, tpose_s states when the subject stands in the T-pose, "
-            "bone_from_imu_wxyz = [1, 0, 0, 0] a sensor whose axes are the bone's"
+            "motion the cameras saw, tpose_s states when the subject stands in the T-pose, npose_s "
+            "in the N-pose, bone_from_imu_wxyz = [1, 0, 0, 0] a sensor whose axes are the bone's"
         )
-    start_s, end_s = subject.tpose_s
+    if imu.static_file is not None:
+        track = read_imu(imu.static_file, format=imu.format, sensor=imu.sensor, rate_hz=imu.rate_hz)
+    start_s, end_s = subject.still_s
     inside = (track.times_s >= start_s) & (track.times_s <= end_s)
     if not inside.any():
         raise SessionError(
-            f"{where}: no sample in tpose_s = [{start_s:g}, {end_s:g}]; its samples run from "
+            f"{where}: no sample in {_still(subject)}; its samples run from "
             f"{track.times_s[0]:g} to {track.times_s[-1]:g} s"
         )
-    turned = from_wxyz(track.orientation_wxyz[inside])
+    return replace(
+        track,
+        times_s=track.times_s[inside],
+        orientation_wxyz=track.orientation_wxyz[inside],
+        accel_m_s2=track.accel_m_s2[inside],
+    )
+
+
+def world_from_still_bone(subject: SubjectSettings, bone: str) -> np.ndarray:
+    """(3, 3) how the bone is turned in the pose of `still_samples`."""
+    facing = Rotation.from_euler("y", subject.tpose_facing_deg, degrees=True)
+    side, _, part = bone.partition("_")
+    if subject.npose_s is not None and part in ("upper_arm", "forearm", "hand"):
+        facing *= Rotation.from_euler("z", -90 if side == "left" else 90, degrees=True)
+    return facing.as_matrix()
+
+
+def _still(subject: SubjectSettings) -> str:
+    key = "tpose_s" if subject.tpose_s is not None else "npose_s"
+    start_s, end_s = subject.still_s or (0.0, 0.0)
+    return f"{key} = [{start_s:g}, {end_s:g}]"
+
+
+def _bone_from_imu(subject: SubjectSettings, imu: ImuSettings, track: ImuTrack) -> np.ndarray:
+    if imu.bone_from_imu_wxyz is not None:
+        return from_wxyz(imu.bone_from_imu_wxyz).as_matrix()
+    if subject.still_s is None and track.bone_from_imu is not None:
+        return track.bone_from_imu
+    turned = from_wxyz(still_samples(subject, imu, track).orientation_wxyz)
     mean = turned.mean()
     moved_deg = float(np.degrees(np.percentile((mean.inv() * turned).magnitude(), 95)))
     if moved_deg > TPOSE_MOVED_DEG:
         raise SessionError(
-            f"{where}: turns by {moved_deg:.0f} deg within tpose_s = [{start_s:g}, {end_s:g}]; "
-            "choose a stretch in which the subject stands still in the T-pose"
+            f"imu '{imu.bone}' of '{subject.name}': turns by {moved_deg:.0f} deg within "
+            f"{_still(subject)}; choose a stretch in which the subject stands still in this pose"
         )
     world_from_imu = world_from_imu_world(imu.imu_up, imu.heading_deg) @ mean.as_matrix()
-    world_from_bone = Rotation.from_euler("y", subject.tpose_facing_deg, degrees=True).as_matrix()
-    return world_from_bone.T @ world_from_imu
+    return world_from_still_bone(subject, imu.bone).T @ world_from_imu

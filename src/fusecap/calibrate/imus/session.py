@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +21,7 @@ from fusecap.calibrate.imus.motion import (
 )
 from fusecap.calibrate.imus.reference import ReferenceMotion, reference_motion
 from fusecap.calibrate.imus.tpose import TPose, look_at_tpose
-from fusecap.errors import InputError
+from fusecap.errors import InputError, SessionError
 from fusecap.geometry.quaternions import to_wxyz
 from fusecap.progress import Progress
 from fusecap.sources.imu_calibration_files import CalibratedImu
@@ -143,9 +144,8 @@ def worn_by(session: Session, subject: SubjectSettings) -> list[Worn]:
     worn = []
     for settings, track in _on_session_clock(session, subject):
         tpose = None
-        if subject.tpose_s is not None:
-            start_s, end_s = subject.tpose_s
-            if ((track.times_s >= start_s) & (track.times_s <= end_s)).any():
+        if subject.still_s is not None:
+            with suppress(SessionError):  # of a sensor that was silent meanwhile
                 tpose = look_at_tpose(subject, settings, track)
         worn.append(Worn(settings=settings, track=track, tpose=tpose))
     return worn

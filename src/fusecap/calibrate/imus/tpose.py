@@ -12,12 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
-from fusecap.errors import SessionError
 from fusecap.geometry.quaternions import from_wxyz
 from fusecap.sources.imu_files.track import ImuTrack
 from fusecap.sources.session import ImuSettings, SubjectSettings
+from fusecap.sources.session_sensors import still_samples, world_from_still_bone
 from fusecap.sources.synchronizer import world_from_imu_world
 
 STILL_DEG = 4.0
@@ -55,35 +54,23 @@ class TPose:
 
 
 def look_at_tpose(subject: SubjectSettings, imu: ImuSettings, track: ImuTrack) -> TPose:
-    """The sensor within `tpose_s`; raises `SessionError` without an interval or samples in it."""
-    where = f"imu '{imu.bone}' of '{subject.name}'"
-    if subject.tpose_s is None:
-        raise SessionError(
-            f"{where}: subject '{subject.name}' has no tpose_s; give the interval in which it "
-            "stands in the rest pose, or calibrate with --from motion"
-        )
-    start_s, end_s = subject.tpose_s
-    inside = (track.times_s >= start_s) & (track.times_s <= end_s)
-    if not inside.any():
-        raise SessionError(
-            f"{where}: no sample in tpose_s = [{start_s:g}, {end_s:g}]; its samples run from "
-            f"{track.times_s[0]:g} to {track.times_s[-1]:g} s"
-        )
+    """The sensor in the T- or N-pose; raises as `still_samples`."""
+    still = still_samples(subject, imu, track)
     upright = world_from_imu_world(imu.imu_up, 0.0)
-    turned = from_wxyz(track.orientation_wxyz[inside])
+    turned = from_wxyz(still.orientation_wxyz)
     mean = turned.mean()
-    accel = track.accel_m_s2[inside]
-    known = np.isfinite(accel).all(axis=1)
+    known = np.isfinite(still.accel_m_s2).all(axis=1)
     gravity_deg = float("nan")
     if known.any():
-        force = upright @ from_wxyz(track.orientation_wxyz[inside][known]).apply(accel[known]).mean(
-            axis=0
-        )
+        force = upright @ turned[known].apply(still.accel_m_s2[known]).mean(axis=0)
         gravity_deg = float(np.degrees(np.arccos(force[1] / np.linalg.norm(force))))
-    bone = Rotation.from_euler("y", subject.tpose_facing_deg, degrees=True).as_matrix()
+    bone = world_from_still_bone(subject, imu.bone)
     sensor = upright @ mean.as_matrix()
     return TPose(
-        time_s=(start_s + end_s) / 2,
+        # A static trial has no time on the motion's clock: before it.
+        time_s=float(track.times_s[0])
+        if imu.static_file is not None
+        else float(still.times_s[0] + still.times_s[-1]) / 2,
         bone_in_world=bone,
         sensor_in_imu_world=sensor,
         bone_from_imu=bone.T @ world_from_imu_world("y", imu.heading_deg) @ sensor,

@@ -48,6 +48,8 @@ class ImuTrack:
     clock: SharedClock | None = None
     heading_known: bool = True
     """Whether other sensors share the imu_world; else each faces anywhere."""
+    bone_from_imu: np.ndarray | None = None
+    """(3, 3) how it sits on the bone that it is named after, where the recorder has found that."""
 
     @property
     def rate_hz(self) -> float:
