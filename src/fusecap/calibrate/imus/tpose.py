@@ -59,10 +59,12 @@ def look_at_tpose(subject: SubjectSettings, imu: ImuSettings, track: ImuTrack) -
     upright = world_from_imu_world(imu.imu_up, 0.0)
     turned = from_wxyz(still.orientation_wxyz)
     mean = turned.mean()
-    known = np.isfinite(still.accel_m_s2).all(axis=1)
+    known = np.flatnonzero(np.isfinite(still.accel_m_s2).all(axis=1))
     gravity_deg = float("nan")
-    if known.any():
-        force = upright @ turned[known].apply(still.accel_m_s2[known]).mean(axis=0)
+    if len(known):
+        force = upright @ from_wxyz(still.orientation_wxyz[known]).apply(
+            still.accel_m_s2[known]
+        ).mean(axis=0)
         gravity_deg = float(np.degrees(np.arccos(force[1] / np.linalg.norm(force))))
     bone = world_from_still_bone(subject, imu.bone)
     sensor = upright @ mean.as_matrix()
