@@ -11,6 +11,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
 
+_ENDS = ("SIGINT", "SIGTERM", "SIGHUP")
+
+
+def ends_are_ctrl_c() -> None:
+    """SIGTERM and SIGHUP do what Ctrl-C does, unless somebody ignores or handles them."""
+    for name in _ENDS[1:]:
+        number = getattr(signal, name, None)  # Windows knows no SIGHUP
+        if number is not None and signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, signal.default_int_handler)
+
 
 class Interruption:
     """Ctrl-C as a question: `asked` once it came; a second one is raised at once."""
@@ -27,24 +37,26 @@ class Interruption:
 
 @contextmanager
 def ctrl_c_held() -> Iterator[Interruption]:
-    """Ctrl-C is noted while this lasts, for whoever asks.
+    """Ctrl-C, and what ends a command as it does, is noted while this lasts, for whoever asks.
 
     Nothing changes where Ctrl-C is not Python's own `KeyboardInterrupt`: in other threads than the
     main one, in workers that ignore it, in programs with handlers of their own. Within another of
     these the interruption is that one's.
     """
-    handler = signal.getsignal(signal.SIGINT)
-    if isinstance(handler, Interruption):
-        yield handler
+    numbers = [getattr(signal, name) for name in _ENDS if hasattr(signal, name)]
+    handlers = {number: signal.getsignal(number) for number in numbers}
+    outer = [handler for handler in handlers.values() if isinstance(handler, Interruption)]
+    if outer:
+        yield outer[0]
         return
     interruption = Interruption()
-    if handler is not signal.default_int_handler:
-        yield interruption
-        return
+    held = [n for n, handler in handlers.items() if handler is signal.default_int_handler]
     with suppress(ValueError):  # in another thread
-        signal.signal(signal.SIGINT, interruption)
+        for number in held:
+            signal.signal(number, interruption)
     try:
         yield interruption
     finally:
         with suppress(ValueError):
-            signal.signal(signal.SIGINT, handler)
+            for number in held:
+                signal.signal(number, signal.default_int_handler)

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -27,8 +29,8 @@ from fusecap.recording.layout import SUFFIX
 from fusecap.recording.reader import RecordedEvent, RecordedPose, Recording
 from fusecap.recording.setup_json import setup_from_values
 from fusecap.setup import SessionSetup
-from fusecap.stored_take import load_take
-from fusecap.take import Take, provenance, take_from_theta
+from fusecap.stored_take import StoredTake
+from fusecap.take import BLOCK, Take, provenance, save_blocks, take_from_theta
 from fusecap.take_builder import TakeBuilder
 from fusecap.types import Estimate
 
@@ -160,6 +162,12 @@ class RecordedMotion:
         reference = BodyShape.from_height(session.skeleton, REFERENCE_HEIGHT_M)
         self._shapes = [index.bodies.get(name, reference) for name in names]
 
+    def save(self, path: Path) -> None:
+        """All of it as a take's file; raises `TakeError`."""
+        count = len(self.timestamps_ns)
+        blocks = (np.arange(at, min(at + BLOCK, count)) for at in range(0, count, BLOCK))
+        save_blocks(self.at_frames([]), map(self.at_frames, blocks), path)
+
     @property
     def tracked(self) -> Bool[np.ndarray, "s t"]:
         """Whose pose was sent; a diverged one is found when it is read."""
@@ -223,15 +231,28 @@ class RecordedMotion:
         )
 
 
-def recorded_take(recording: Recording, progress: Progress | None = None) -> Take:
-    """All poses as they were recorded, without solving again; raises `InputError` without any."""
-    motion = RecordedMotion(recording, RecordingIndex(recording, progress=progress))
-    return motion.at_frames(np.arange(len(motion.timestamps_ns)))
+@contextmanager
+def opened_take(
+    path: Path, tell: Callable[[str], None], progress: Progress | None = None
+) -> Iterator[StoredTake]:
+    """A take, which is checked and stays in its file, or the poses of a recording as sent.
 
-
-def open_take(path: Path, progress: Progress | None = None) -> Take:
-    """A solved take (.npz), or the poses of a live run as they were recorded (.mcap)."""
-    return recorded_take(Recording(path), progress) if path.suffix == SUFFIX else load_take(path)
+    Those become a file that lasts as long as this; `tell` is told what of them is not there.
+    """
+    if path.suffix == SUFFIX:
+        recording = Recording(path)
+        motion = RecordedMotion(recording, RecordingIndex(recording, progress=progress))
+        with TemporaryDirectory(prefix="fusecap-") as folder:
+            copy = Path(folder) / "poses.npz"
+            motion.save(copy)
+            for text in loss_notes(recording):
+                tell(text)
+            with StoredTake(copy) as take:
+                yield take
+    else:
+        with StoredTake(path) as take:
+            take.check()
+            yield take
 
 
 def loss_notes(recording: Recording) -> tuple[str, ...]:
@@ -240,10 +261,11 @@ def loss_notes(recording: Recording) -> tuple[str, ...]:
     notes = []
     if not recording.from_start:
         notes.append("it was begun in mid-run: what the run knew before is not in it")
-    if loss.missing_events:
+    if loss.damaged:
         notes.append(
-            f"{loss.missing_events} events are missing ({loss.broken_chunks} broken chunks, "
-            f"{loss.malformed} broken messages): poses after them can differ from those of the run"
+            f"it is damaged: {loss.missing_events} events are missing ({loss.broken_chunks} broken "
+            f"chunks, {loss.malformed} broken messages): poses after them can differ from those of "
+            "the run, and are missing where they were sent"
         )
     if loss.note:
         notes.append(f"it ended early: {loss.note}")

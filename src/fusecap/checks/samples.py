@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Iterable
 
 import numpy as np
@@ -11,6 +12,7 @@ from fusecap.findings import Findings
 from fusecap.setup import SessionSetup
 from fusecap.sources.imu_files.track import ImuTrack
 from fusecap.sources.keypoint_files import KeypointTrack
+from fusecap.sources.people_store import PeopleStore, chosen
 from fusecap.sources.session import Session
 from fusecap.types import CameraSample, ImuSample
 
@@ -18,29 +20,34 @@ LEAST_SAMPLES = 3
 
 
 def check_samples(setup: SessionSetup, samples: Iterable[CameraSample | ImuSample]) -> Findings:
-    """What they say against themselves.
+    """What they say against themselves, in whichever order they come; none of them is kept.
 
-    Nothing of sources that were hardly heard, nor of sensors whose mounting is not known yet.
+    Those of no camera or sensor, or of other keypoints, are left out. Nothing is said of sources
+    that were hardly heard, nor of sensors whose mounting is not known yet.
     """
-    seen: dict[int, dict[int, np.ndarray]] = {}
-    worn: dict[tuple[str, str], dict[int, ImuSample]] = {}
+    keypoints = len(setup.landmarks.landmark_names), 3
+    seen = [_Seen(keypoints) for _ in setup.rig.names]
+    worn = {(s.name, imu.bone): _Worn() for s in setup.session.subjects for imu in s.imus}
     for sample in samples:
-        if isinstance(sample, CameraSample):
-            seen.setdefault(sample.camera, {})[sample.timestamp_ns] = sample.people
-        else:
-            worn.setdefault((sample.subject, sample.bone), {})[sample.timestamp_ns] = sample
+        if isinstance(sample, ImuSample):
+            if (sample.subject, sample.bone) in worn:
+                worn[sample.subject, sample.bone].add(sample)
+        elif 0 <= sample.camera < len(seen) and sample.people.shape[1:] == keypoints:
+            seen[sample.camera].add(sample)
     session = _with_mounted(setup.session)
-    keypoints = [
-        _keypoints(setup, camera, people)
-        for camera, people in sorted(seen.items())
-        if len(people) >= LEAST_SAMPLES
-    ]
+    tracks = [camera.track(setup, name) for name, camera in zip(setup.rig.names, seen, strict=True)]
     imus = {
-        subject.name: [_imu(worn.get((subject.name, imu.bone), {})) for imu in subject.imus]
+        subject.name: [worn.pop((subject.name, imu.bone)).track() for imu in subject.imus]
         for subject in session.subjects
     }
     findings = Findings()
-    check_motion(session, setup.rig if len(setup.rig) else None, keypoints, imus, findings)
+    check_motion(
+        session,
+        setup.rig if len(setup.rig) else None,
+        [track for track in tracks if track is not None],
+        imus,
+        findings,
+    )
     return findings
 
 
@@ -54,28 +61,53 @@ def _with_mounted(session: Session) -> Session:
     return session.model_copy(update={"subjects": subjects})
 
 
-def _keypoints(setup: SessionSetup, camera: int, people: dict[int, np.ndarray]) -> KeypointTrack:
-    times_s = 1e-9 * np.array(sorted(people))
-    step_s = np.diff(times_s)
-    typical_s = float(np.median(step_s))
-    steps = np.maximum(np.round(step_s / typical_s).astype(np.int64), 1)
-    return KeypointTrack(
-        name=setup.rig.names[camera],
-        landmarks=setup.landmarks,
-        rate_hz=1.0 / typical_s,
-        frames=np.concatenate([[0], np.cumsum(steps)]),
-        times_s=times_s,
-        people=tuple(people[ns] for ns in sorted(people)),
-        broken=(),
-    )
+class _Seen:
+    """What one camera saw."""
+
+    def __init__(self, keypoints: tuple[int, int]) -> None:
+        self._times_ns = array("q")
+        self._people = PeopleStore(*keypoints)
+
+    def add(self, sample: CameraSample) -> None:
+        self._times_ns.append(sample.timestamp_ns)
+        self._people.append(sample.people)
+
+    def track(self, setup: SessionSetup, name: str) -> KeypointTrack | None:
+        times_ns, rows = np.unique(self._times_ns, return_index=True)
+        if len(rows) < LEAST_SAMPLES:
+            return None
+        step_s = 1e-9 * np.diff(times_ns)
+        typical_s = float(np.median(step_s))
+        steps = np.maximum(np.round(step_s / typical_s).astype(np.int64), 1)
+        return KeypointTrack(
+            name=name,
+            landmarks=setup.landmarks,
+            rate_hz=1.0 / typical_s,
+            frames=np.concatenate([[0], np.cumsum(steps)]),
+            times_s=1e-9 * times_ns,
+            people=chosen(self._people, rows),
+            broken=(),
+        )
 
 
-def _imu(samples: dict[int, ImuSample]) -> ImuTrack | None:
-    if len(samples) < LEAST_SAMPLES:
-        return None
-    in_order = [samples[ns] for ns in sorted(samples)]
-    return ImuTrack(
-        times_s=1e-9 * np.array(sorted(samples)),
-        orientation_wxyz=np.array([sample.orientation_wxyz for sample in in_order]),
-        accel_m_s2=np.array([sample.accel_m_s2 for sample in in_order]),
-    )
+class _Worn:
+    """What one sensor measured."""
+
+    def __init__(self) -> None:
+        self._times_ns = array("q")
+        self._values = array("f")
+
+    def add(self, sample: ImuSample) -> None:
+        if 0.1 < np.linalg.norm(sample.orientation_wxyz) < 10.0:
+            self._times_ns.append(sample.timestamp_ns)
+            self._values.extend(sample.orientation_wxyz)
+            self._values.extend(sample.accel_m_s2)
+
+    def track(self) -> ImuTrack | None:
+        times_ns, rows = np.unique(self._times_ns, return_index=True)
+        if len(rows) < LEAST_SAMPLES:
+            return None
+        values = np.frombuffer(self._values, np.float32).reshape(-1, 7)[rows]
+        return ImuTrack(
+            times_s=1e-9 * times_ns, orientation_wxyz=values[:, :4], accel_m_s2=values[:, 4:]
+        )

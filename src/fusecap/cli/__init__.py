@@ -47,6 +47,7 @@ from fusecap.cli import (
 from fusecap.cli.common import print_json
 from fusecap.cli.terminal import err, remark
 from fusecap.errors import FusecapError
+from fusecap.interrupts import ends_are_ctrl_c
 
 # It warns wherever it cannot keep its list of fonts, as in a home that is read only.
 logging.getLogger("matplotlib").setLevel(logging.ERROR)
@@ -117,6 +118,7 @@ evaluate_datasets.add_to(evaluate)
 
 def main() -> None:
     """Entry point: errors become one readable line, never a traceback."""
+    ends_are_ctrl_c()
     try:
         app()
     except FusecapError as error:

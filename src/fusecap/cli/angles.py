@@ -106,7 +106,7 @@ def _angles_of(
 ) -> None:
     from fusecap.angles.gait import gait_cycles
     from fusecap.angles.joint_angles import joint_angles
-    from fusecap.batch.replay import open_take
+    from fusecap.batch.replay import opened_take
     from fusecap.checks.keypoints import UNMEASURED
     from fusecap.edits.edit import solve_notes
     from fusecap.exports import angle_files
@@ -116,11 +116,21 @@ def _angles_of(
     target = out or _target(take)
     if target.suffix != ".csv":
         raise InputError(f"--out {target}: the table of angles is a .csv file")
-    opened = open_take(take)
-    people = np.flatnonzero(opened.tracked.any(axis=1)).tolist()
-    if not people:
-        raise TakeError(f"{take}: nobody is tracked in any frame of the take: there are no angles")
-    found = joint_angles(opened)
+    with opened_take(take, note) as opened:
+        people = np.flatnonzero(opened.tracked.any(axis=1)).tolist()
+        if not people:
+            raise TakeError(
+                f"{take}: nobody is tracked in any frame of the take: there are no angles"
+            )
+        found = joint_angles(opened)
+        unmeasured = [text for text in solve_notes(opened) if UNMEASURED in text]
+        walks = {}
+        if gait:
+            whole = opened.of_frames(0, len(opened.timestamps_ns))
+            walks = {
+                row: [gait_cycles(whole, found, row, side) for side in ("left", "right")]
+                for row in people
+            }
     angle_files.write_angles_csv(found, target)
     files = [target]
     names = distinct_names(found.subject_names)
@@ -141,10 +151,6 @@ def _angles_of(
     if gait:
         from fusecap.exports.angle_plot import plot_gait
 
-        walks = {
-            row: [gait_cycles(opened, found, row, side) for side in ("left", "right")]
-            for row in people
-        }
         files.append(target.with_name(f"{target.stem}_gait.csv"))
         angle_files.write_gait_csv(
             [(found.subject_names[row], each) for row, sides in walks.items() for each in sides],
@@ -159,7 +165,6 @@ def _angles_of(
                 if not len(each.deg):
                     note(f"'{name}' has no gait cycle of the {each.side} foot: {each.why_none}")
     list_made(take, files)
-    unmeasured = [text for text in solve_notes(opened) if UNMEASURED in text]
     for text in unmeasured:
         note(text)
     summary = {

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -20,8 +19,7 @@ from fusecap.files import plain
 
 if TYPE_CHECKING:
     from fusecap.batch.solve import Solved
-    from fusecap.exports.take_format import AnyTake, ExportOptions
-    from fusecap.progress import Progress
+    from fusecap.exports.take_format import ExportOptions
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object for machines.")]
 Unit = Annotated[
@@ -146,22 +144,6 @@ def write_take(solved: Solved, path: Path, exports: Exports, *, picture: bool) -
     finally:
         set_aside_earlier(path, files)
     return files
-
-
-@contextmanager
-def opened_take(path: Path, progress: Progress | None = None) -> Iterator[AnyTake]:
-    """A take, which is checked and stays in its file, or the poses of a recording as sent."""
-    from fusecap.recording.layout import SUFFIX
-    from fusecap.stored_take import StoredTake
-
-    if path.suffix == SUFFIX:
-        from fusecap.batch.replay import open_take
-
-        yield open_take(path, progress)
-    else:
-        with StoredTake(path) as take:
-            take.check()
-            yield take
 
 
 def set_aside_earlier(take: Path, files: Iterable[Path]) -> None:

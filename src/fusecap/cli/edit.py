@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from fusecap.cli.common import Json, length_m, named_once, print_json, set_aside_earlier
-from fusecap.cli.terminal import console, wrote
+from fusecap.cli.terminal import console, note, wrote
 from fusecap.errors import InputError
 
 EXAMPLE = (
@@ -53,7 +53,7 @@ def edit(
     Edits are done in the order of these options. A solve is smooth already: all instants of a
     person are solved together; the filter is for those who must report one.
     """
-    from fusecap.batch.replay import open_take
+    from fusecap.batch.replay import opened_take
     from fusecap.edits.edit import EditOptions, edit_take
     from fusecap.exports.made_files import made_stem
     from fusecap.take import save_take
@@ -77,7 +77,8 @@ def edit(
         foot_lock=foot_lock,
         floor_shift_m=_signed_m(floor_shift),
     )
-    original = open_take(take)
+    with opened_take(take, note) as opened:
+        original = opened.of_frames(0, len(opened.timestamps_ns))
     edited = edit_take(original, options)
     save_take(edited, target)
     set_aside_earlier(target, [])

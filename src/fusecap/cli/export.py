@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from fusecap.cli.common import Json, RigName, Unit, checked_exports, opened_take, print_json
+from fusecap.cli.common import Json, RigName, Unit, checked_exports, print_json
 from fusecap.cli.many import (
     Again,
     OnRay,
@@ -26,7 +26,7 @@ from fusecap.exports.formats import FORMATS
 
 if TYPE_CHECKING:
     from fusecap.exports.take_files import TakeFile
-    from fusecap.exports.take_format import AnyTake
+    from fusecap.stored_take import StoredTake
 
 EXAMPLE = "Example: fusecap export take.npz --format bvh,glb --rig mixamo --out files"
 _FORMATS_HELP = "One, or several with commas. " + "; ".join(
@@ -93,7 +93,7 @@ def already(
     """
     if session is not None:
         return None
-    with _planned(path, out, format, unit, rig, session) as (_, planned):
+    with _planned(path, out, format, unit, rig, session) as (_, planned, _):
         files = [file.path for file in planned]
     return {"files": [str(file) for file in files]} if are_newer(files, [path]) else None
 
@@ -101,8 +101,9 @@ def already(
 @contextmanager
 def _planned(
     path: Path, out: Path | None, format: str, unit: str | None, rig: str, session: Path | None
-) -> Iterator[tuple[AnyTake, list[TakeFile]]]:
-    """The take, and what to write of it."""
+) -> Iterator[tuple[StoredTake, list[TakeFile], list[str]]]:
+    """The take, what to write of it, and what a user must know about it."""
+    from fusecap.batch.replay import opened_take
     from fusecap.exports.made_files import made_stem
     from fusecap.exports.take_files import plan_files
     from fusecap.exports.take_format import ExportOptions
@@ -115,7 +116,8 @@ def _planned(
 
         loaded = load_session(session)
         options = ExportOptions(cameras=open_rig(loaded)[0], landmarks=common_landmarks(loaded))
-    with opened_take(path) as take:
+    notes: list[str] = []
+    with opened_take(path, notes.append) as take:
         files = plan_files(
             take,
             out or path.parent,
@@ -125,7 +127,7 @@ def _planned(
             rig=exports.rig,
             options=options,
         )
-        yield take, files
+        yield take, files, notes
 
 
 def _export_one(
@@ -142,12 +144,12 @@ def _export_one(
     from fusecap.exports.take_files import held_poses
 
     files: list[Path] = []
-    with _planned(take, out, format, unit, rig, session) as (opened, planned):
+    with _planned(take, out, format, unit, rig, session) as (opened, planned, notes):
         for file in planned:
             file.write(opened)
             files.append(file.path)
             list_made(take, files)
-        notes = held_poses(opened, planned)
+        notes += held_poses(opened, planned)
     if as_json:
         print_json({"files": [str(path) for path in files], "notes": notes})
         return

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from fusecap.cli.common import Json, print_json
-from fusecap.cli.terminal import err, progress, wrote
+from fusecap.cli.terminal import err, note, progress, wrote
 from fusecap.errors import InputError
 
 EXAMPLE = "Example: fusecap overlay duo/duo.npz"
@@ -38,7 +38,7 @@ def overlay(
     but are nobody of the take are thin and grey. Ctrl-C leaves a whole video of what was drawn.
     """
     from fusecap.batch.overlay import draw_take
-    from fusecap.batch.replay import open_take
+    from fusecap.batch.replay import opened_take
     from fusecap.exports.made_files import list_made, made_stem
     from fusecap.files import check_writable
     from fusecap.sources.session import FILE_NAME
@@ -53,9 +53,9 @@ def overlay(
         )
     check_writable(folder / "x.mp4")
     loaded = with_detections(load_session(session or beside))
-    with progress(quiet=as_json) as show:
-        opened = open_take(take, show)
-        drawn = draw_take(opened, loaded, folder, made_stem(take), show)
+    with progress(quiet=as_json) as show, opened_take(take, note, show) as opened:
+        whole = opened.of_frames(0, len(opened.timestamps_ns))
+        drawn = draw_take(whole, loaded, folder, made_stem(take), show)
     list_made(take, drawn.files)
     if as_json:
         files = [str(path) for path in drawn.files]

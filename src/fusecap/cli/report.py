@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from fusecap.cli.common import Json, opened_take, print_json
+from fusecap.cli.common import Json, print_json
 from fusecap.cli.many import (
     Again,
     OnRay,
@@ -92,6 +92,7 @@ def _target(take: Path) -> Path:
 
 
 def _report_of(take: Path, session: Path | None, out: Path | None, *, as_json: bool) -> None:
+    from fusecap.batch.replay import opened_take
     from fusecap.batch.report_page import report_page
     from fusecap.batch.seen import look_back
     from fusecap.batch.solved_inputs import inputs_beside, open_solved_inputs
@@ -104,7 +105,7 @@ def _report_of(take: Path, session: Path | None, out: Path | None, *, as_json: b
     check_writable(target)
     notes: list[str] = []
     seen, findings = None, ()
-    with progress(quiet=as_json) as show, opened_take(take, show) as opened:
+    with progress(quiet=as_json) as show, opened_take(take, notes.append, show) as opened:
         if not len(opened.timestamps_ns):
             raise TakeError(f"{take}: the take has no frame: nothing to report; solve it again")
         if session is None:

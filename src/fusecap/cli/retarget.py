@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from fusecap.cli.common import Json, named_once, opened_take, print_json
+from fusecap.cli.common import Json, named_once, print_json
 from fusecap.cli.terminal import console, note, table_of, wrote
 from fusecap.files import safe_name
 
@@ -38,6 +38,7 @@ def retarget(
 
     Bones are matched by VRM's map or by their names, and shown.
     """
+    from fusecap.batch.replay import opened_take
     from fusecap.exports.characters.retarget import retarget as onto
     from fusecap.exports.made_files import list_made, made_stem
     from fusecap.exports.take_files import held_pose
@@ -45,7 +46,8 @@ def retarget(
     whose = "" if subject is None else f"_{safe_name(subject)}"
     stem = f"{made_stem(take)}{whose}_{safe_name(character.stem)}"
     ending = ".fbx" if character.suffix.lower() == ".fbx" else ".glb"
-    with opened_take(take) as opened:
+    notes: list[str] = []
+    with opened_take(take, notes.append) as opened:
         done = onto(
             opened,
             character,
@@ -53,7 +55,7 @@ def retarget(
             subject=subject,
             bones=named_once("--map", map, "BONE=NAME"),
         )
-        notes = held_pose(opened, done.subject, [done.path.suffix])
+        notes += held_pose(opened, done.subject, [done.path.suffix])
     list_made(take, [done.path])
     if as_json:
         told = {"files": [str(done.path)], "bones": done.bones, "scale": done.scale}

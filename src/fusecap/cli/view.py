@@ -70,9 +70,10 @@ def view(
     from fusecap.stored_take import StoredTake
     from fusecap.viewer.backdrop import videos_of
 
-    detections = None
+    detections, unread = None, None
     if take.suffix == SUFFIX:
-        loaded, detections = _recorded(take, as_json)
+        loaded, detections, read = _recorded(take, as_json)
+        unread = None if read else take
     else:
         loaded = StoredTake(take)
         loaded.check()
@@ -106,6 +107,7 @@ def view(
         videos={} if filmed is None or take.suffix == SUFFIX else videos_of(filmed),
         curves=curves,
         detections=detections,
+        unread=unread,
         host=host,
         port=port,
         browser=not no_browser,
@@ -153,13 +155,18 @@ def look(
     videos: Mapping[str, OpenVideo] = MappingProxyType({}),
     curves: Sequence[BoneCurve],
     detections: RecordedDetections | None = None,
+    unread: Path | None = None,
     host: str = "127.0.0.1",
     port: int | None = None,
     browser: bool = True,
     as_json: bool = False,
 ) -> None:
-    """Serve a page until Ctrl-C, which is how it is closed and so no failure."""
+    """Serve a page until Ctrl-C, which is how it is closed and so no failure.
+
+    `unread` is a recording of which it is not known yet what is damaged.
+    """
     from fusecap.viewer.page import Page
+    from fusecap.viewer.recording import look_for_damage
     from fusecap.viewer.take import TakePage
 
     page = Page(title, host=host, port=port)
@@ -169,13 +176,20 @@ def look(
                 page, take, rig=rig, videos=videos, curves=curves, detections=detections
             )
             _announce(page, browser=browser, as_json=as_json)
+
+            def tell(text: str) -> None:
+                note(text)
+                shown.tell(text)
+
+            if unread is not None:
+                look_for_damage(unread, tell)
             shown.run()
         finally:
             page.stop()
 
 
-def _recorded(path: Path, quiet: bool) -> tuple[ViewedTake, RecordedDetections | None]:
-    """The poses of a recording, and its detections where it has cameras."""
+def _recorded(path: Path, quiet: bool) -> tuple[ViewedTake, RecordedDetections | None, bool]:
+    """The poses of a recording, its detections where it has cameras; whether all of it was read."""
     from fusecap.batch.replay import RecordedMotion, loss_notes, recorded_setup
     from fusecap.recording.index import RecordingIndex
     from fusecap.recording.reader import Recording
@@ -188,7 +202,7 @@ def _recorded(path: Path, quiet: bool) -> tuple[ViewedTake, RecordedDetections |
         note(text)
     setup = recorded_setup(recording)
     detections = RecordedDetections(index, setup) if len(setup.rig) else None
-    return RecordedMotion(recording, index), detections
+    return RecordedMotion(recording, index), detections, index.read_whole
 
 
 def _announce(page: Page, *, as_json: bool, browser: bool) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from array import array
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -21,31 +23,34 @@ def diagnose_recording(path: Path | str, progress: Progress | None = None) -> li
     """What is in a recording, and what is not; raises `InputError` for another file."""
     recording = Recording(path)
     setup = recorded_setup(recording)
-    cameras: dict[str, list[int]] = {name: [] for name in setup.rig.names}
-    sensors: dict[str, dict[str, list[int]]] = {
-        subject.name: {imu.bone: [] for imu in subject.imus}
+    cameras = {name: array("q") for name in setup.rig.names}
+    sensors = {
+        subject.name: {imu.bone: array("q") for imu in subject.imus}
         for subject in setup.session.subjects
         if subject.imus
     }
     ticks_ns: list[int] = []
     poses: dict[str, int] = {}
     commands = 0
-    samples: list[CameraSample | ImuSample] = []
-    for item in recording.items(progress):
-        match item:
-            case RecordedEvent(event=CameraSample() as sample):
-                samples.append(sample)
-                cameras[setup.rig.names[sample.camera]].append(sample.timestamp_ns)
-            case RecordedEvent(event=ImuSample() as sample):
-                samples.append(sample)
-                sensors[sample.subject][sample.bone].append(sample.timestamp_ns)
-            case RecordedEvent(event=Tick() as tick):
-                ticks_ns += [] if tick.ahead else [tick.timestamp_ns]
-            case RecordedEvent():
-                commands += 1
-            case RecordedPose():
-                poses[item.name] = poses.get(item.name, 0) + 1
-    findings = Findings()
+
+    def samples() -> Iterator[CameraSample | ImuSample]:
+        nonlocal commands
+        for item in recording.items(progress):
+            match item:
+                case RecordedEvent(event=CameraSample() as sample):
+                    cameras[setup.rig.names[sample.camera]].append(sample.timestamp_ns)
+                    yield sample
+                case RecordedEvent(event=ImuSample() as sample):
+                    sensors[sample.subject][sample.bone].append(sample.timestamp_ns)
+                    yield sample
+                case RecordedEvent(event=Tick() as tick):
+                    ticks_ns.extend([] if tick.ahead else [tick.timestamp_ns])
+                case RecordedEvent():
+                    commands += 1
+                case RecordedPose():
+                    poses[item.name] = poses.get(item.name, 0) + 1
+
+    findings, checked = Findings(), check_samples(setup, samples())
     _whole(recording, findings)
     _contents(recording, ticks_ns, poses, commands, findings)
     for name, times_ns in cameras.items():
@@ -53,7 +58,7 @@ def diagnose_recording(path: Path | str, progress: Progress | None = None) -> li
     for subject, bones in sensors.items():
         for bone, times_ns in bones.items():
             _source(f"imu '{bone}' of '{subject}'", times_ns, findings)
-    findings += check_samples(setup, samples)
+    findings += checked
     return findings.sorted()
 
 
@@ -68,7 +73,7 @@ def _whole(recording: Recording, findings: Findings) -> None:
         )
     if loss.note:
         findings.add("warning", where, f"ended before it was asked to: {loss.note}")
-    if loss.missing_events or loss.malformed or loss.broken_chunks:
+    if loss.damaged:
         findings.add(
             "warning",
             where,
@@ -105,7 +110,7 @@ def _contents(
     )
 
 
-def _source(where: str, times_ns: list[int], findings: Findings) -> None:
+def _source(where: str, times_ns: array[int], findings: Findings) -> None:
     if len(times_ns) < 2:
         findings.add("warning", where, f"{len(times_ns)} samples", "see whether it was connected")
         return

@@ -12,19 +12,20 @@ from fusecap.edits.butterworth import butterworth
 from fusecap.edits.foot_lock import lock_feet
 from fusecap.edits.gaps import fill_gaps, mark_gaps
 from fusecap.errors import InputError
+from fusecap.stored_take import StoredTake
 from fusecap.take import Take, made_by
 
 SOLVE_REPORT = "report_before_edits"
 """Where an edited take's provenance has the report of its solve: people and frames were others."""
 
 
-def solve_report(take: Take) -> Mapping[str, Any]:
+def solve_report(take: Take | StoredTake) -> Mapping[str, Any]:
     """What the solve said of itself, also before edits; nothing where a take does not tell it."""
     report = take.provenance.get("report", take.provenance.get(SOLVE_REPORT))
     return report if isinstance(report, Mapping) else {}
 
 
-def solve_notes(take: Take) -> list[str]:
+def solve_notes(take: Take | StoredTake) -> list[str]:
     """The notes in it."""
     notes = solve_report(take).get("notes")
     return [str(note) for note in notes] if isinstance(notes, list) else []

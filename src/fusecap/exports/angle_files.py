@@ -17,18 +17,18 @@ import numpy as np
 from fusecap.angles.gait import PERCENT, GaitCycles
 from fusecap.angles.joint_angles import JointAngles
 from fusecap.exports.opensim import write_motion
-from fusecap.files import write_whole
+from fusecap.files import written_whole
 
 
 def write_angles_csv(angles: JointAngles, path: Path) -> None:
     """One row per frame and person, whole or not at all."""
     head = [f"{name}_deg" for name in angles.names] + [f"{name}_sd_deg" for name in angles.names]
-    values = np.concatenate([angles.deg, angles.sd_deg], axis=2)
+    deg, sd_deg = angles.deg, angles.sd_deg
     _write_csv(
         path,
         ["frame", "time_s", "person", *head],
         (
-            [frame, f"{time_s:.6f}", person, *_cells(values[row, frame])]
+            [frame, f"{time_s:.6f}", person, *_cells(deg[row, frame]), *_cells(sd_deg[row, frame])]
             for frame, time_s in enumerate(angles.time_s.tolist())
             for row, person in enumerate(angles.subject_names)
         ),
@@ -63,11 +63,13 @@ def write_gait_csv(people: Sequence[tuple[str, GaitCycles]], path: Path) -> None
 
 
 def _write_csv(path: Path, head: list[str], rows: Iterable[list[object]]) -> None:
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(head)
-    table.writerows(rows)
-    write_whole(path, text.getvalue())
+    with written_whole(path) as file:
+        text = io.TextIOWrapper(file, encoding="utf-8", newline="")
+        table = csv.writer(text, lineterminator="\n")
+        table.writerow(head)
+        table.writerows(rows)
+        text.flush()
+        text.detach()
 
 
 def _cells(values: np.ndarray) -> list[str]:

@@ -1,13 +1,14 @@
 """Where a recording's poses and samples are, so that those of one instant can be read alone.
 
 A finished recording tells it of poses and keypoints at its end; of another one, and where all
-events are wanted, all is unpacked once. 24 bytes are kept of a message.
+events are wanted, all is unpacked once. 12 bytes are kept of a message.
 """
 
 from __future__ import annotations
 
 import struct
 from array import array
+from bisect import bisect_right
 from collections.abc import Collection, Sequence
 from functools import lru_cache
 
@@ -18,7 +19,15 @@ from mcap.opcode import Opcode
 from fusecap.body.shape import BodyShape
 from fusecap.progress import Progress
 from fusecap.recording.layout import BODY, EVENTS, KEYPOINTS, POSE, RecordedBody
-from fusecap.recording.reader import Entry, EventNumbers, Item, Loss, Messages, Recording
+from fusecap.recording.reader import (
+    MAX_BYTES,
+    Entry,
+    EventNumbers,
+    Item,
+    Loss,
+    Messages,
+    Recording,
+)
 from fusecap.recording.told import INDEXED, Topic, told_by
 
 _RECORDS_KEPT = 8
@@ -36,7 +45,10 @@ class Places:
         self.schema = schema
         self.times_ns = array("q")
         """Of the samples, on the session's clock."""
-        self._records, self._starts = array("q"), array("q")
+        self.broken: set[int] = set()
+        """Rows that were read and found malformed, or not there."""
+        self._starts = array("I")
+        self._records, self._first = array("q"), array("q")
 
     def add(
         self,
@@ -45,13 +57,16 @@ class Places:
         times_ns: Int[np.ndarray, " n"],
     ) -> None:
         """The next ones: of which record in the file, from where in it, when."""
-        self._records.frombytes(record_at.tobytes())
-        self._starts.frombytes(start.tobytes())
+        new = np.flatnonzero(np.diff(record_at, prepend=self._records[-1:] or [-1]))
+        self._records.frombytes(record_at[new].tobytes())
+        self._first.frombytes((new + len(self.times_ns)).tobytes())
+        inside = (start >= 0) & (start < MAX_BYTES)
+        self._starts.frombytes(np.where(inside, start, MAX_BYTES).astype(np.uint32).tobytes())
         self.times_ns.frombytes(times_ns.tobytes())
 
     def at(self, row: int) -> tuple[int, int]:
         """Of which record, from where in it."""
-        return self._records[row], self._starts[row]
+        return self._records[bisect_right(self._first, row) - 1], self._starts[row]
 
 
 class RecordingIndex:
@@ -83,6 +98,8 @@ class RecordingIndex:
         self._unpacked = lru_cache(_RECORDS_KEPT)(recording.unpacked)
         bodies: dict[str, Places] = {}
         told = None if events else told_by(recording.path)
+        self.read_whole = told is None
+        """Else what is damaged within the file is not known yet."""
         if told is None:
             numbers = EventNumbers()
             for some in recording.messages(progress, numbers):
@@ -124,7 +141,12 @@ class RecordingIndex:
         places.add(topic.record_at[rows], topic.start[rows], times_ns)
 
     def read(self, places: Places, row: int) -> Item | None:
-        """A message; None for one that is malformed, or is not there as the index says."""
+        """A message; None for one that is malformed, or is not there as the index says.
+
+        `loss` counts such a one the first time.
+        """
+        if row in places.broken:
+            return None
         record_at, start = places.at(row)
         data = self._unpacked(record_at)
         try:
@@ -132,22 +154,26 @@ class RecordingIndex:
         except struct.error:
             opcode = length = sequence = publish_ns = 0
         publish_ns -= self._recording.unix_minus_session_ns
-        if opcode != Opcode.MESSAGE or publish_ns != places.times_ns[row]:
-            self._recording.loss.malformed += 1
-            return None
-        first = start + _MESSAGE.size
-        return self._recording.read(
-            Entry(
-                schema=places.schema,
-                topic="",
-                sequence=sequence,
-                log_ns=0,
-                publish_ns=publish_ns,
-                record_at=record_at,
-                start=first,
-                content=data[first : first + length - _BEFORE_CONTENT],
+        item = None
+        if opcode == Opcode.MESSAGE and publish_ns == places.times_ns[row]:
+            first = start + _MESSAGE.size
+            item = self._recording.read(
+                Entry(
+                    schema=places.schema,
+                    topic="",
+                    sequence=sequence,
+                    log_ns=0,
+                    publish_ns=publish_ns,
+                    record_at=record_at,
+                    start=first,
+                    content=data[first : first + length - _BEFORE_CONTENT],
+                )
             )
-        )
+        else:
+            self._recording.loss.malformed += 1
+        if item is None:
+            places.broken.add(row)
+        return item
 
 
 def _topics(some: Messages, numbers: EventNumbers, schemas: Collection[str]) -> list[Topic]:

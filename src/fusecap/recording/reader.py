@@ -159,6 +159,11 @@ class Loss:
         """No event is missing among those that were read."""
         return self.missing_events == 0
 
+    @property
+    def damaged(self) -> bool:
+        """Something within the file is missing or broken."""
+        return bool(self.missing_events or self.malformed or self.broken_chunks)
+
 
 class Recording:
     """A log whose header has been read; raises `InputError` for anything else."""

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import overload
 
 import numpy as np
+from jaxtyping import Int
 
 from fusecap.files import Spool
 
@@ -69,6 +70,17 @@ class PeopleStore(_Frames):
         return np.frombuffer(raw, dtype=self._dtype).reshape(end - first, *self._numbers)
 
 
+class _Chosen(_Frames):
+    def __init__(self, frames: Sequence[People], rows: Int[np.ndarray, " n"]) -> None:
+        self._frames, self._rows = frames, rows
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def at(self, frame: int) -> People:
+        return self._frames[int(self._rows[frame])]
+
+
 class _Changed(_Frames):
     def __init__(self, frames: Sequence[People], change: Callable[[People], People]) -> None:
         self._frames, self._change = frames, change
@@ -87,6 +99,11 @@ class _Changed(_Frames):
                 self._blocks.popitem(last=False)
         self._blocks.move_to_end(number)
         return self._blocks[number][row]
+
+
+def chosen(frames: Sequence[People], rows: Int[np.ndarray, " n"]) -> Sequence[People]:
+    """These frames, in this order."""
+    return _Chosen(frames, rows)
 
 
 def changed(frames: Sequence[People], change: Callable[[People], People]) -> Sequence[People]:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import threading
 from bisect import bisect_right
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Callable, Mapping
+from pathlib import Path
 
 import numpy as np
 import viser
 
+from fusecap.errors import InputError
 from fusecap.recording.index import Places, RecordingIndex
 from fusecap.recording.layout import KEYPOINTS
-from fusecap.recording.reader import RecordedEvent
+from fusecap.recording.reader import RecordedEvent, Recording
 from fusecap.setup import SessionSetup
 from fusecap.types import CameraSample
 from fusecap.viewer.figure import Pose
@@ -22,6 +26,27 @@ SHOWN_HZ = 10.0
 """Of each camera's detections."""
 _OLD_NS = 500_000_000
 """After which a detection is no longer of the present."""
+
+
+def look_for_damage(path: Path, tell: Callable[[str], None]) -> threading.Thread:
+    """Reads all of a recording beside the page, and tells what is broken in it; until the end."""
+
+    def look() -> None:
+        try:
+            recording = Recording(path)
+            deque(recording.messages(), maxlen=0)
+        except InputError as error:
+            tell(str(error))
+            return
+        if recording.loss.damaged:
+            tell(
+                f"{path.name} is damaged in {recording.loss.broken_chunks} places of about half a "
+                "second each, where people are missing; what else is: fusecap doctor"
+            )
+
+    thread = threading.Thread(target=look, name="damage", daemon=True)
+    thread.start()
+    return thread
 
 
 class RecordedDetections:

@@ -82,6 +82,7 @@ class TakePage:
         frames = drawn(np.arange(len(take.timestamps_ns)))
         seen = take.at_frames(frames)
         colours = {name: person_rgb(row) for row, name in enumerate(take.subject_names)}
+        self._told = page.gui.add_html("")
         room = Room(page, rig)
         self._people = People(page.scene, take.skeleton, colours)
         self._controls = PlaybackControls(page.gui, take.time_s)
@@ -103,6 +104,10 @@ class TakePage:
         self._plots = self._add_plots([sigma_curve(seen, take.time_s[frames]), *curves], colours)
         self._drawn: tuple[int, tuple[bool, ...]] | None = None
         self._draw(0, 0.0, plots=True)
+
+    def tell(self, text: str) -> None:
+        """Something that whoever looks should know, above all else."""
+        self._told.content = f'<div style="{_SMALL}">{escaped(text)}</div>'
 
     def run(self, stopping: threading.Event | None = None) -> None:
         """Plays until `stopping` is set, or interrupted; sends nothing while nobody looks."""
