@@ -23,13 +23,8 @@ import numpy as np
 
 from fusecap.batch.solve import SessionInstants, solve_instants
 from fusecap.body.landmarks import LandmarkSet
-from fusecap.calibrate.offsets import (
-    OffsetSamples,
-    calibrate_session,
-    measure_offsets,
-    median_offsets,
-    self_calibrate,
-)
+from fusecap.calibrate.offset_samples import OffsetSamples, measure_offsets
+from fusecap.calibrate.offsets import calibrate_session, median_offsets, self_calibrate
 from fusecap.evaluate.datasets.shelf import load_truth, score_people
 from fusecap.evaluate.score import score_take
 from fusecap.evaluate.simulated_solve import solve_simulation

@@ -1,24 +1,35 @@
 """Whether the memory of `fusecap solve` grows with the length of a session.
 
-    uv run --frozen python benchmarks/solve_memory.py --minutes 2 8 30
+    uv run --frozen python benchmarks/solve_memory.py --minutes 2 8 30 [--recording]
 
 The demo's two people with 13 sensors each in four cameras, simulated, to and fro for so many
-minutes; prints peak memory (Linux), seconds and how many times real time.
+minutes, as a session or as the recording of a live run; prints peak memory (Linux), seconds and how
+many times real time.
 """
 
 from __future__ import annotations
 
 import argparse
+import heapq
 import os
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 from fusecap.evaluate.demo_scene import demo_scene
 from fusecap.evaluate.simulated_session import write_session
+from fusecap.recording.setup_json import setup_values
+from fusecap.recording.writer import RecordingWriter
+from fusecap.setup import SessionSetup
+from fusecap.sources.imu_files import ImuTrack
+from fusecap.sources.session_data import open_session
+from fusecap.sources.session_file import load_session
+from fusecap.types import CameraSample, ImuSample, Tick
 
+Timed = CameraSample | ImuSample | Tick
 SECONDS, RATE_HZ = 10.0, 60
 
 
@@ -45,6 +56,50 @@ def lengthen(folder: Path, minutes: float) -> None:
             os.link(source, camera / f"frame_{number:012d}_keypoints.json")
 
 
+def as_recording(folder: Path) -> Path:
+    """What a live run of the session leaves, without poses."""
+    data = open_session(load_session(folder))
+    assert data.landmarks is not None
+    setup = SessionSetup(
+        session=data.session, rig=data.rig, landmarks=data.landmarks, simulated=True
+    )
+
+    def seen(camera: int) -> Iterator[Timed]:
+        track = data.keypoints[camera]
+        for row, time_s in enumerate(track.times_s):
+            at_ns = round(1e9 * time_s)
+            yield CameraSample(camera=camera, timestamp_ns=at_ns, people=track.people[row])
+
+    def worn(subject: str, bone: str, track: ImuTrack) -> Iterator[Timed]:
+        for row, time_s in enumerate(track.times_s):
+            yield ImuSample(
+                subject=subject,
+                bone=bone,
+                timestamp_ns=round(1e9 * time_s),
+                orientation_wxyz=track.orientation_wxyz[row],
+                accel_m_s2=track.accel_m_s2[row],
+            )
+
+    sources = [seen(camera) for camera in range(len(data.keypoints))]
+    for subject in data.session.subjects:
+        for imu, track in zip(subject.imus, data.samples[subject.name], strict=True):
+            assert track is not None
+            sources.append(worn(subject.name, imu.bone, track))
+    ticks = (Tick(timestamp_ns=ns) for ns in data.timestamps_ns.tolist())
+    path = folder / "run.mcap"
+    with path.open("wb") as file:
+        writer = RecordingWriter(
+            file, setup_values(setup), cameras=setup.rig.names, unix_minus_session_ns=10**18
+        )
+        in_order = heapq.merge(*sources, ticks, key=lambda event: event.timestamp_ns)
+        for number, event in enumerate(in_order):
+            writer.event(event, event.timestamp_ns)
+            if number % 900 == 899:  # half a second
+                writer.flush()
+        writer.finish()
+    return path
+
+
 def solve(session: Path) -> tuple[float, float]:
     """Peak memory [MB] and seconds."""
     began = time.perf_counter()
@@ -61,11 +116,14 @@ def solve(session: Path) -> tuple[float, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, nargs="+", default=[1.0, 4.0])
-    for minutes in parser.parse_args().minutes:
+    parser.add_argument("--recording", action="store_true")
+    told = parser.parse_args()
+    for minutes in told.minutes:
         with tempfile.TemporaryDirectory() as name:
             session = write_session(demo_scene(seconds=SECONDS), Path(name))
             lengthen(Path(name), minutes)
-            peak_mb, seconds = solve(session)
+            solved = as_recording(Path(name)) if told.recording else session
+            peak_mb, seconds = solve(solved)
         print(
             f"{minutes:5.1f} min  peak {peak_mb:6.0f} MB  {seconds:6.0f} s  "
             f"{minutes * 60 / seconds:.1f} times real time (two people)",

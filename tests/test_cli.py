@@ -157,16 +157,16 @@ def test_with_json_a_failure_is_json_too(tmp_path):
     assert "nowhere" in json.loads(result.stdout)["error"]
 
 
-@pytest.mark.parametrize("stage", ["sorting", "solving"])
+@pytest.mark.parametrize(("stage", "by"), [("sorting", "SIGTERM"), ("solving", "SIGINT")])
 def test_ctrl_c_leaves_a_valid_take_of_what_was_solved_beside_the_whole_one(
-    session, tmp_path, stage
+    session, tmp_path, stage, by
 ):
     script = tmp_path / "interrupted.py"
     script.write_text(_INTERRUPTED_SOLVE)
     out = tmp_path / "take.npz"
     out.write_bytes(b"a whole take")
     (tmp_path / "take_anna.bvh").write_bytes(b"a whole export")
-    command = [sys.executable, script, stage, "solve", session, "--out", out, "--json"]
+    command = [sys.executable, script, stage, by, "solve", session, "--out", out, "--json"]
     command += ["--export", "bvh"]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 130, result.stderr
@@ -188,13 +188,13 @@ from contextlib import contextmanager
 import fusecap.cli.solve as command
 from fusecap.cli import main
 
-stage = sys.argv.pop(1)
+stage, number = sys.argv.pop(1), getattr(signal, sys.argv.pop(1))
 
 @contextmanager
 def interrupting(*, quiet):
     def show(what, done, total):
         if what == stage and done == 60:
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(number)
     yield show
 
 command.progress = interrupting

@@ -23,7 +23,7 @@ from fusecap.calibrate.sync import session as sync
 from fusecap.cli import evaluate_datasets
 from fusecap.evaluate import cells
 from fusecap.evaluate.datasets.recording import DatasetSequence
-from fusecap.interrupts import ctrl_c_held
+from fusecap.interrupts import ctrl_c_held, ends_are_ctrl_c
 from fusecap.recording.reader import Recording
 from fusecap.setup import setup_of
 from fusecap.solve import whole_motion
@@ -57,6 +57,54 @@ def test_a_second_ctrl_c_ends_at_once():
             press()
         assert inner is stop
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+ENDS = [signal.SIGTERM, signal.SIGHUP]
+
+
+@pytest.fixture
+def handled():
+    """What is done by SIGTERM and SIGHUP comes back afterwards."""
+    before = {number: signal.getsignal(number) for number in ENDS}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize("number", ENDS)
+def test_a_command_is_ended_as_by_ctrl_c(number, handled):
+    ends_are_ctrl_c()
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(number)
+    with ctrl_c_held() as stop:
+        signal.raise_signal(number)
+        assert stop.asked
+        with pytest.raises(KeyboardInterrupt):
+            press()
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(number)
+
+
+def test_who_ignores_an_end_goes_on_doing_so(handled):
+    """As `nohup` does."""
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    ends_are_ctrl_c()
+    with ctrl_c_held() as stop:
+        signal.raise_signal(signal.SIGHUP)
+    signal.raise_signal(signal.SIGHUP)
+    assert not stop.asked
+
+
+def test_an_end_is_held_where_ctrl_c_is_ignored(handled):
+    """As in a job that a shell put into the background."""
+    ends_are_ctrl_c()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with ctrl_c_held() as stop:
+            signal.raise_signal(signal.SIGTERM)
+        assert stop.asked
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def test_an_error_leaves_python_s_own_handler():

@@ -8,15 +8,8 @@ from fusecap.body.landmarks import LANDMARKS, LandmarkOffsets, landmark_set_name
 from fusecap.body.pose import forward_kinematics, landmarks_in_world
 from fusecap.body.shape import BodyShape
 from fusecap.body.skeleton import PAPER21
-from fusecap.calibrate.offsets import (
-    MAX_MOVE,
-    _assigned,
-    calibrate_session,
-    measure_offsets,
-    median_offsets,
-    reprojection_error_px,
-    self_calibrate,
-)
+from fusecap.calibrate.offset_samples import _assigned, measure_offsets, reprojection_error_px
+from fusecap.calibrate.offsets import MAX_MOVE, calibrate_session, median_offsets, self_calibrate
 from fusecap.cli import main
 from fusecap.errors import InputError, SessionError
 from fusecap.evaluate.demo_scene import demo_scene

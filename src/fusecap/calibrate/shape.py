@@ -33,13 +33,12 @@ from fusecap.batch.solve import Instants, solve_instants
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.body.shape import MAX_HEIGHT_M, MIN_HEIGHT_M, BodyShape
 from fusecap.body.skeleton import Skeleton
-from fusecap.calibrate.offsets import (
-    JOINT_SIGMA,
+from fusecap.calibrate.offset_samples import (
     MIN_SAMPLES,
-    SURFACE_SIGMA,
     measure_offsets,
     reprojection_error_px,
 )
+from fusecap.calibrate.offsets import JOINT_SIGMA, SURFACE_SIGMA
 from fusecap.errors import InputError, nearest
 from fusecap.evaluate.metrics import Summary
 from fusecap.progress import Progress

@@ -19,7 +19,9 @@ from fusecap.files import plain
 
 if TYPE_CHECKING:
     from fusecap.batch.solve import Solved
+    from fusecap.exports.take_files import TakeFile
     from fusecap.exports.take_format import ExportOptions
+    from fusecap.stored_take import StoredTake
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object for machines.")]
 Unit = Annotated[
@@ -83,6 +85,21 @@ class Exports:
     rig: str = "native"
     options: ExportOptions | None = None
 
+    def planned(self, take: StoredTake, path: Path, folder: Path | None = None) -> list[TakeFile]:
+        """What to write of the take at `path`; beside it unless told."""
+        from fusecap.exports.made_files import made_stem
+        from fusecap.exports.take_files import plan_files
+
+        return plan_files(
+            take,
+            folder or path.parent,
+            formats=self.formats,
+            stem=made_stem(path),
+            unit=self.unit,
+            rig=self.rig,
+            options=self.options,
+        )
+
 
 def checked_exports(option: str, text: str, unit: str | None, rig: str) -> Exports:
     """Of a comma-separated list of formats, checked before any work, with the libraries they need.
@@ -109,8 +126,8 @@ def write_take(solved: Solved, path: Path, exports: Exports, *, picture: bool) -
     solve's report. What an interrupted solve has goes beside `path`, by names of its own: a whole
     take stays.
     """
-    from fusecap.exports.made_files import list_made, made_stem
-    from fusecap.exports.take_files import held_poses, plan_files
+    from fusecap.exports.made_files import list_made
+    from fusecap.exports.take_files import held_poses
     from fusecap.stored_take import StoredTake
 
     if solved.report.interrupted:
@@ -121,15 +138,7 @@ def write_take(solved: Solved, path: Path, exports: Exports, *, picture: bool) -
     image = path.with_suffix(".png")
     try:
         with StoredTake(path) as take:
-            planned = plan_files(
-                take,
-                path.parent,
-                formats=exports.formats,
-                stem=made_stem(path),
-                unit=exports.unit,
-                rig=exports.rig,
-                options=exports.options,
-            )
+            planned = exports.planned(take, path)
             for file in planned:
                 file.write(take)
                 files.append(file.path)

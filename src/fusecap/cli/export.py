@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -104,30 +105,19 @@ def _planned(
 ) -> Iterator[tuple[StoredTake, list[TakeFile], list[str]]]:
     """The take, what to write of it, and what a user must know about it."""
     from fusecap.batch.replay import opened_take
-    from fusecap.exports.made_files import made_stem
-    from fusecap.exports.take_files import plan_files
-    from fusecap.exports.take_format import ExportOptions
 
     exports = checked_exports("--format", format, unit, rig)
-    options = ExportOptions()
     if session is not None:
+        from fusecap.exports.take_format import ExportOptions
         from fusecap.sources.session_cameras import common_landmarks, open_rig
         from fusecap.sources.session_file import load_session
 
         loaded = load_session(session)
-        options = ExportOptions(cameras=open_rig(loaded)[0], landmarks=common_landmarks(loaded))
+        seen = ExportOptions(cameras=open_rig(loaded)[0], landmarks=common_landmarks(loaded))
+        exports = replace(exports, options=seen)
     notes: list[str] = []
     with opened_take(path, notes.append) as take:
-        files = plan_files(
-            take,
-            out or path.parent,
-            formats=exports.formats,
-            stem=made_stem(path),
-            unit=exports.unit,
-            rig=exports.rig,
-            options=options,
-        )
-        yield take, files, notes
+        yield take, exports.planned(take, path, out), notes
 
 
 def _export_one(

@@ -112,8 +112,6 @@ def solve(
 def already(path: Path, **options: Any) -> dict[str, Any] | None:
     """The report of a take that is newer than all that its session names, with all exports."""
     from fusecap.errors import TakeError
-    from fusecap.exports.made_files import made_stem
-    from fusecap.exports.take_files import plan_files
     from fusecap.recording.layout import SUFFIX
     from fusecap.sources.session_file import input_files, load_session
     from fusecap.stored_take import StoredTake
@@ -133,15 +131,7 @@ def already(path: Path, **options: Any) -> dict[str, Any] | None:
         )
         with StoredTake(target) as stored:
             told = stored.provenance
-            planned = plan_files(
-                stored,
-                target.parent,
-                formats=exports.formats,
-                stem=made_stem(target),
-                unit=exports.unit,
-                rig=exports.rig,
-                options=exports.options,
-            )
+            planned = exports.planned(stored, target)
         if told.get("made_by") != made_by() or not isinstance(told.get("report"), dict):
             return None
         if planned and not are_newer([file.path for file in planned], [target]):

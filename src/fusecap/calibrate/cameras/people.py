@@ -56,7 +56,7 @@ from fusecap.calibrate.cameras.people_rounds import (
     triangulated,
 )
 from fusecap.calibrate.cameras.people_sightings import Sightings, roughness, sight, stride_of
-from fusecap.calibrate.offsets import reprojection_error_px
+from fusecap.calibrate.offset_samples import reprojection_error_px
 from fusecap.errors import InputError
 from fusecap.geometry.camera import Rig
 from fusecap.geometry.similarity import Similarity

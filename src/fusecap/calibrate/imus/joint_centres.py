@@ -30,7 +30,7 @@ from scipy.spatial.transform import Rotation
 from fusecap.body.landmarks import LandmarkSet
 from fusecap.body.skeleton import Skeleton
 from fusecap.calibrate.imus.fit import CORRELATION_S, Fit, Pairs, linearised, robust_weights
-from fusecap.calibrate.offsets import SAME_INSTANT_NS, measure_offsets
+from fusecap.calibrate.offset_samples import SAME_INSTANT_NS, measure_offsets
 from fusecap.geometry.camera import Rig
 from fusecap.take import Take
 from fusecap.types import Detections
