@@ -79,7 +79,7 @@ def exchange(pipeline: Pipeline) -> None:
     """The first two subjects' tracks, with what is known of their poses."""
     tracker = pipeline._sorter
     assert isinstance(tracker, Tracker)
-    first, second = [place for place in tracker._cast._places if place.live][:2]
+    first, second = [place for place in tracker._cast.places if place.live][:2]
     one, other = first.track, second.track
     assert one is not None and other is not None
     first.track, second.track = other, one

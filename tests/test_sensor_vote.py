@@ -8,8 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fusecap.associate.admission import Admission
 from fusecap.associate.anatomy import Anatomy
 from fusecap.associate.options import TrackerOptions
+from fusecap.associate.renaming import contradicted, pair_anew
 from fusecap.associate.sensor_vote import FITS, SensorVote
 from fusecap.associate.subjects import Cast, Subject
 from fusecap.associate.track import SURELY_APART, Track
@@ -186,15 +188,11 @@ class ToldVote(SensorVote):
 
 
 def cast_of(simulation, *names, **options):
-    landmark_set = simulation.landmark_set
+    """A cast, and who admits to it."""
+    anatomy, options = Anatomy(simulation.landmark_set), TrackerOptions(**options)
     subjects = [Subject(name=name) for name in names]
-    return Cast(
-        subjects,
-        simulation.rig,
-        Anatomy(landmark_set),
-        TrackerOptions(**options),
-        itertools.count(100),
-    )
+    cast = Cast(subjects, simulation.rig, anatomy, options, itertools.count(100))
+    return cast, Admission(cast, simulation.rig, anatomy, options)
 
 
 def standing_at(simulation, number, x_m, born_s, seen_s):
@@ -209,10 +207,10 @@ def standing_at(simulation, number, x_m, born_s, seen_s):
 
 @pytest.mark.parametrize("apart", [True, False])
 def test_who_walked_beside_a_wearer_does_not_become_the_wearer_who_leaves(simulation, apart):
-    cast = cast_of(simulation, "x", max_subjects=1)
+    cast, door = cast_of(simulation, "x", max_subjects=1)
     wearer = standing_at(simulation, 1, 0.0, 0.0, 0.0)
     other = standing_at(simulation, 2, 2.0, 0.0, 0.0)
-    cast.admit([wearer], 0, ToldVote({(1, "x"): 0.05}))
+    door.admit([wearer], 0, ToldVote({(1, "x"): 0.05}))
     assert cast.ids() == {1}
     if apart:
         wearer.beside[other] = other.beside[wearer] = SURELY_APART
@@ -220,19 +218,19 @@ def test_who_walked_beside_a_wearer_does_not_become_the_wearer_who_leaves(simula
     wearer.seen_ns = wearer.triangulated_ns = minute_ns
     other.seen_ns = other.triangulated_ns = now_ns
     cast.forget([other], now_ns)
-    cast.admit([other], now_ns, ToldVote({(2, "x"): 0.05}))
+    door.admit([other], now_ns, ToldVote({(2, "x"): 0.05}))
     assert cast.returned == ({} if apart else {2: (1, minute_ns)})
 
 
 def test_whom_sensors_did_not_fit_is_no_evidence_against_who_wears_them(simulation):
-    cast = cast_of(simulation, "x", max_subjects=1)
+    cast, door = cast_of(simulation, "x", max_subjects=1)
     mistaken = standing_at(simulation, 1, 0.0, 0.0, 0.0)
     wearer = standing_at(simulation, 2, 2.0, 0.0, 1.0)
-    cast.admit([mistaken], 0, ToldVote({(1, "x"): 0.05}))
-    cast.contradicted(ToldVote({(1, "x"): 0.9}), 0)
+    door.admit([mistaken], 0, ToldVote({(1, "x"): 0.05}))
+    contradicted(cast, ToldVote({(1, "x"): 0.9}), 0, TrackerOptions())
     mistaken.beside[wearer] = wearer.beside[mistaken] = SURELY_APART
     cast.forget([wearer], 10**9)
-    cast.admit([wearer], 10**9, ToldVote({(2, "x"): 0.05}))
+    door.admit([wearer], 10**9, ToldVote({(2, "x"): 0.05}))
     assert cast.returned == {2: (1, 0)}
 
 
@@ -240,39 +238,39 @@ def test_whom_sensors_did_not_fit_is_no_evidence_against_who_wears_them(simulati
 def test_a_missing_wearer_holds_back_those_who_may_be_it_and_nobody_else(
     simulation, misfit, admitted_as
 ):
-    cast = cast_of(simulation, "x", "y", max_subjects=2)
+    cast, door = cast_of(simulation, "x", "y", max_subjects=2)
     wearer = standing_at(simulation, 1, 0.0, 0.0, 0.0)
-    cast.admit([wearer], 0, ToldVote({(1, "x"): 0.05}))
+    door.admit([wearer], 0, ToldVote({(1, "x"): 0.05}))
     now_ns = 10 * 10**9
     newcomer = standing_at(simulation, 3, 0.1, 9.5, 10.0)
     beside = standing_at(simulation, 4, 3.0, 9.9, 9.9)
     cast.forget([newcomer, beside], now_ns)
-    cast.admit([newcomer, beside], now_ns, ToldVote({(3, "x"): misfit}))
+    door.admit([newcomer, beside], now_ns, ToldVote({(3, "x"): misfit}))
     followed = dict(cast.followed())
     assert followed == ({admitted_as: newcomer} if admitted_as else {})
 
 
 def test_whoever_is_followed_under_another_wearers_name_gets_its_own_and_the_name_waits(simulation):
-    cast = cast_of(simulation, "x", "y", max_subjects=2)
+    cast, door = cast_of(simulation, "x", "y", max_subjects=2)
     body = standing_at(simulation, 1, 0.0, 0.0, 1.0)
-    cast.admit([body], 10**9, ToldVote({(1, "x"): 0.05, (1, "y"): 0.6}))
+    door.admit([body], 10**9, ToldVote({(1, "x"): 0.05, (1, "y"): 0.6}))
     told = ToldVote({(1, "x"): 0.6, (1, "y"): 0.05})
-    renumbered = cast.pair_anew([body], told, 10**9)
+    renumbered = pair_anew(cast, [body], told, 10**9)
     assert dict(cast.followed()) == {"y": body} and renumbered == {1: body.track_id}
     assert body.track_id != 1, "x keeps its identity"
     wearer = standing_at(simulation, 7, 2.0, 0.5, 1.0)
-    cast.admit([body, wearer], 10**9, ToldVote({(7, "x"): 0.05, (7, "y"): 0.6}))
+    door.admit([body, wearer], 10**9, ToldVote({(7, "x"): 0.05, (7, "y"): 0.6}))
     assert dict(cast.followed()) == {"x": wearer, "y": body} and wearer.track_id == 1
 
 
 @pytest.mark.parametrize("misfit", [0.05, 0.9])
 def test_sensors_name_whom_only_two_views_see_at_once(simulation, misfit):
-    cast = cast_of(simulation, "x", max_subjects=1)
+    cast, door = cast_of(simulation, "x", max_subjects=1)
     newcomer = standing_at(simulation, 1, 0.0, 0.0, 0.3)
     newcomer.frames, newcomer.strong_frames = 18, 0
     beside = standing_at(simulation, 2, 3.0, 0.0, 0.3)
     told = ToldVote({(1, "x"): misfit, (2, "x"): 0.9})
-    cast.admit([newcomer, beside], 300_000_000, told)
+    door.admit([newcomer, beside], 300_000_000, told)
     assert dict(cast.followed()) == ({"x": newcomer} if misfit < FITS else {})
 
 
@@ -298,17 +296,17 @@ def test_who_was_out_of_sight_is_heard_anew():
 def test_a_wearer_who_was_taken_for_somebody_without_sensors_gets_the_own_name(
     simulation, also_fits
 ):
-    cast = cast_of(simulation, "x", max_subjects=3)
+    cast, door = cast_of(simulation, "x", max_subjects=3)
     first, second = (standing_at(simulation, n, 2.0 * n, 0.0, 5.0) for n in range(2))
-    cast.admit([first, second], 5 * 10**9, ToldVote({}))
+    door.admit([first, second], 5 * 10**9, ToldVote({}))
     assert [name for name, _ in cast.followed()] == ["x", "person1"]
     told = ToldVote({(0, "x"): 0.7, (1, "x"): 0.05})
-    assert cast.pair_anew([first, second], told, 5 * 10**9) == {0: 1, 1: 0}
+    assert pair_anew(cast, [first, second], told, 5 * 10**9) == {0: 1, 1: 0}
     assert dict(cast.followed()) == {"x": second, "person1": first}
     cast.forget([first], 6 * 10**9)
     told = ToldVote({(1, "x"): 0.05, (5, "x"): 0.1 if also_fits else 0.9})
     third = standing_at(simulation, 5, 9.0, 0.0, 6.0)
-    assert bool(cast.pair_anew([first, third], told, 6 * 10**9)) != also_fits
+    assert bool(pair_anew(cast, [first, third], told, 6 * 10**9)) != also_fits
     followed = {"person1": first} if also_fits else {"x": first}
     assert dict(cast.followed()) == followed
 
@@ -320,30 +318,32 @@ def test_a_wearer_who_was_taken_for_somebody_without_sensors_gets_the_own_name(
 def test_whoever_is_found_late_may_have_walked_away_from_the_start(simulation, born_s, x_m, found):
     anatomy, ids = Anatomy(simulation.landmark_set), itertools.count(100)
     subjects = [Subject(name="x", start_m=(0.0, 0.0))]
-    cast = Cast(subjects, simulation.rig, anatomy, TrackerOptions(max_subjects=1), ids)
-    cast.admit([], 0, ToldVote({}))
+    options = TrackerOptions(max_subjects=1)
+    cast = Cast(subjects, simulation.rig, anatomy, options, ids)
+    door = Admission(cast, simulation.rig, anatomy, options)
+    door.admit([], 0, ToldVote({}))
     newcomer = standing_at(simulation, 1, x_m, born_s, born_s + 2.0)
-    cast.admit([newcomer], newcomer.seen_ns, ToldVote({}))
+    door.admit([newcomer], newcomer.seen_ns, ToldVote({}))
     assert bool(cast.followed()) == found
 
 
 def test_of_two_wearers_whom_nobody_follows_neither_takes_a_track_that_fits_both(simulation):
-    cast = cast_of(simulation, "x", "y", max_subjects=3)
+    cast, door = cast_of(simulation, "x", "y", max_subjects=3)
     body = standing_at(simulation, 1, 0.0, 0.0, 1.0)
     cast.add("z")
-    cast.admit([body], 10**9, ToldVote({(1, "z"): 0.05, (1, "x"): 0.9, (1, "y"): 0.9}))
+    door.admit([body], 10**9, ToldVote({(1, "z"): 0.05, (1, "x"): 0.9, (1, "y"): 0.9}))
     assert dict(cast.followed()) == {"z": body}
     told = ToldVote({(1, "x"): 0.10, (1, "y"): 0.11})
-    assert not cast.pair_anew([body], told, 10**9)
-    assert cast.pair_anew([body], ToldVote({(1, "x"): 0.10, (1, "y"): 0.5}), 10**9)
+    assert not pair_anew(cast, [body], told, 10**9)
+    assert pair_anew(cast, [body], ToldVote({(1, "x"): 0.10, (1, "y"): 0.5}), 10**9)
     assert dict(cast.followed()) == {"x": body}
 
 
 def test_a_name_of_which_nothing_else_is_known_waits_for_those_who_are_known(simulation):
-    cast = cast_of(simulation, "bob", "x", max_subjects=2)
+    cast, door = cast_of(simulation, "bob", "x", max_subjects=2)
     bob, other = (standing_at(simulation, n, 3.0 * n, 0.0, 1.0) for n in range(2))
-    cast.admit([bob, other], 10**9, ToldVote({}))
-    cast.pair_anew([bob, other], ToldVote({(1, "x"): 0.9, (0, "x"): 0.05}), 10**9)
+    door.admit([bob, other], 10**9, ToldVote({}))
+    pair_anew(cast, [bob, other], ToldVote({(1, "x"): 0.9, (0, "x"): 0.05}), 10**9)
     assert dict(cast.followed()) == {"bob": other, "x": bob}
 
 

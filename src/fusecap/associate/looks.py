@@ -20,7 +20,10 @@ from fusecap.associate.traits import Kind, Trait, telling
 
 NAME = "clothes"
 SAME, OTHER = 0.3, 0.5
-"""Difference up to which two are surely alike, and from which they surely are not."""
+"""Difference up to which two are surely alike, and from which they surely are not.
+
+In the same clothes light from one side alone makes 0.3, so a smaller one moves nobody.
+"""
 MARGIN = 0.15
 """By which one pairing must be better than another, per person."""
 ENOUGH, ENOUGH_TO_MOVE = 6, 15
@@ -54,7 +57,7 @@ def differences(new: Sequence[Trait], old: Sequence[Trait]) -> Float[np.ndarray,
     return np.where(enough, mean.sum(axis=2) / np.maximum(weight.sum(axis=2), 1e-9), np.nan)
 
 
-CLOTHES = Kind(NAME, SAME, OTHER, MARGIN, ENOUGH_TO_MOVE, differences, settles=(sizes.NAME,))
+CLOTHES = Kind(NAME, SAME, OTHER, SAME, MARGIN, ENOUGH_TO_MOVE, differences, settles=(sizes.NAME,))
 
 
 def learn(

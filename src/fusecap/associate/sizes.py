@@ -41,7 +41,7 @@ def differences(new: Sequence[Trait], old: Sequence[Trait]) -> Float[np.ndarray,
     return np.where(limbs >= MIN_LIMBS, mean, np.nan)
 
 
-SIZES = Kind(NAME, SAME, SAME, MARGIN, ENOUGH, differences)
+SIZES = Kind(NAME, SAME, SAME, 0.0, MARGIN, ENOUGH, differences)
 
 
 def learn(

@@ -28,7 +28,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from fusecap.associate import looks, sizes
+from fusecap.associate import looks, renaming, sizes
+from fusecap.associate.admission import Admission
 from fusecap.associate.anatomy import Anatomy
 from fusecap.associate.candidates import find_candidates
 from fusecap.associate.matching import Matcher
@@ -62,6 +63,7 @@ class Tracker:
         self._landmarks = len(landmark_set.landmark_names)
         ids = itertools.count()
         self._cast = Cast(subjects, rig, self._anatomy, self._options, ids)
+        self._admission = Admission(self._cast, rig, self._anatomy, self._options)
         self._population = Population(self._options, self._anatomy, landmark_set.mirror, ids)
         self._matcher = Matcher(self._options, landmark_set.mirror)
         self._single = len(rig) == 1
@@ -145,26 +147,26 @@ class Tracker:
             self._learn(
                 [tracks[row] for row in rows], views, person[rows], measured[rows], detections
             )
-        self.renumbered, self.renumbered_since_ns = self._cast.return_to_way(
-            everyone, self._vote, now_ns
+        self.renumbered, self.renumbered_since_ns = renaming.return_to_way(
+            self._cast, everyone, self._vote, now_ns, self._options
         )
         self.notes = self._renumbered_notes("somebody was found where they were going")
-        self._cast.admit(everyone, now_ns, self._vote)
+        self._admission.admit(everyone, now_ns, self._vote)
         if not self.renumbered:
-            self.renumbered = self._cast.pair_anew(everyone, self._vote, now_ns)
+            self.renumbered = renaming.pair_anew(self._cast, everyone, self._vote, now_ns)
             self.notes = self._renumbered_notes("sensors say so")
         for kind in (looks.CLOTHES, sizes.SIZES):
             if not self.renumbered and self._turns(now_ns):
-                self.renumbered, self.renumbered_since_ns = self._cast.part_by(
-                    kind, everyone, now_ns, self._vote
+                self.renumbered, self.renumbered_since_ns = renaming.part_by(
+                    self._cast, kind, everyone, now_ns, self._vote
                 )
                 self.notes += self._renumbered_notes(f"{kind.name} say so")
         self.notes += [
             f"{name}: sensors and cameras contradict each other; either nobody who is seen wears "
             "these sensors, or their bones or headings are not as stated (fusecap calibrate imu)"
-            for name in self._cast.contradicted(self._vote, now_ns)
+            for name in renaming.contradicted(self._cast, self._vote, now_ns, self._options)
         ]
-        for track in self._cast.kept_out:
+        for track in self._admission.kept_out:
             if not track.told and (now_ns - track.born_ns) * 1e-9 >= self._options.patience_s:
                 track.told = True
                 self.notes.append(
@@ -389,7 +391,7 @@ class Tracker:
         """Whether sensors or clothes may still tell who a newcomer is."""
         age_s = (now_ns - track.born_ns) * 1e-9
         soon = bool(self._vote.heard) and age_s < self._options.patience_s
-        return soon or track in self._cast.undecided
+        return soon or track in self._admission.undecided
 
     def _renumbered_notes(self, why: str) -> list[str]:
         return [

@@ -120,6 +120,8 @@ class Kind(NamedTuple):
     """Difference up to which two may be one."""
     other: float
     """From which they surely are not."""
+    own: float
+    """Up to which somebody surely looks as before, and is given nobody else's name."""
     margin: float
     """By which one pairing must be better than another, per person."""
     enough: int
@@ -198,8 +200,11 @@ def _moves(kind: Kind, away: Float[np.ndarray, "n n"]) -> dict[int, int]:
     cost = np.where(np.isfinite(away), away, np.inf)[np.ix_(known, known)]
     best = dict(cheapest(cost))
     moves = {a: b for a, b in best.items() if a != b}
-    worse = [cost[a, b] > min(kind.same, cost[a, a] - kind.margin) for a, b in moves.items()]
-    if len(best) < len(known) or any(worse):
+    needless = [
+        cost[a, a] <= kind.own or cost[a, b] > min(kind.same, cost[a, a] - kind.margin)
+        for a, b in moves.items()
+    ]
+    if len(best) < len(known) or any(needless):
         return {}
     least = sum(cost[a, b] for a, b in best.items())
     for a, b in moves.items():
