@@ -10,8 +10,9 @@ WebSocket client does not read and nobody listens to one of the UDP streams; at 
 of the recording is full, and another recording begins.
 
 Checks, and ends with exit code 1 where one fails: people are measured again, at their place and
-with four fifths of the quality before, within 2 s of a fault's end; nothing that is sent is NaN,
-nobody jumps; memory, threads and open files do not grow; the engine never raised.
+with four fifths of the quality before, within 2 s of a fault's end; nobody whom two views see is
+followed wrongly for longer; nothing that is sent is NaN, nobody jumps; memory, threads and open
+files do not grow; the engine never raised.
 """
 
 from __future__ import annotations
@@ -113,6 +114,8 @@ class Watch:
         self.count = 0
         self.times_ns = np.zeros(count, np.int64)
         self.measured = np.zeros((count, len(names)), np.bool_)
+        self.seen = np.zeros((count, len(names)), np.bool_)
+        """By two views or more."""
         self.quality = np.zeros((count, len(names)))
         self.hips_m = np.full((count, len(names), 3), np.nan)
         self.not_finite = 0
@@ -124,13 +127,14 @@ class Watch:
         row = self.count
         if row == len(self.times_ns):
             return
-        solved = {estimate.name for estimate in step.step.estimates}
+        solved = {estimate.name: estimate for estimate in step.step.estimates}
         self.times_ns[row] = step.timestamp_ns
         for place, name in enumerate(self.names):
             estimate = step.people.get(name)
             if estimate is None:
                 continue
             self.measured[row, place] = name in solved
+            self.seen[row, place] = name in solved and solved[name].views.sum() > 1
             self.quality[row, place] = estimate.bone_quality.mean()
             self.hips_m[row, place] = estimate.bone_position_in_world_m[0]
             self.not_finite += not (
@@ -242,6 +246,17 @@ def truth_error_m(watch: Watch, truth: Take, first_ns: int) -> np.ndarray:
     return np.nan_to_num(np.stack(errors, axis=1), nan=np.inf)
 
 
+def longest_wrong_s(watch: Watch, error_m: np.ndarray) -> float:
+    """For how long two views at least followed somebody who was not at their place."""
+    longest = 0
+    for seen, off_m in zip(watch.seen[: watch.count].T, error_m.T, strict=True):
+        wrong = 0
+        for is_seen, is_off in zip(seen, off_m > AT_ITS_PLACE_M, strict=True):
+            wrong = wrong + int(is_seen) if is_off else 0
+            longest = max(longest, wrong)
+    return longest / RATE_HZ
+
+
 @dataclass(frozen=True, kw_only=True)
 class SoakReport:
     """What happened."""
@@ -252,6 +267,7 @@ class SoakReport:
     well_at_the_end: bool
     """For most of the last second everybody was where they are."""
     worst_jump_m: float
+    longest_wrong_s: float
     usual_error_m: float
     """Median over people and instants."""
     not_finite: int
@@ -265,6 +281,8 @@ class SoakReport:
             for r in self.recoveries
             if (lasting and r.recovered_s is None) or (r.recovered_s or 0.0) > recover_s
         ]
+        if self.longest_wrong_s > recover_s:
+            problems.append(f"somebody is followed wrongly for {self.longest_wrong_s:.2f} s")
         if self.not_finite:
             problems.append(f"{self.not_finite} poses are not finite")
         if self.worst_jump_m > JUMP_M:
@@ -325,6 +343,7 @@ def soak(seconds: float, *, seed: int = 0, room_bytes: int | None = None) -> Soa
         recoveries=recoveries(watch, faults, error_m),
         resources=resources,
         worst_jump_m=watch.worst_jump_m(),
+        longest_wrong_s=longest_wrong_s(watch, error_m),
         well_at_the_end=bool((error_m[-RATE_HZ:] < AT_ITS_PLACE_M).mean() > 0.5),
         usual_error_m=float(np.median(error_m)),
         not_finite=watch.not_finite,
@@ -438,7 +457,8 @@ def as_text(report: SoakReport) -> str:
     if len(after_s):
         lines.append(f"after {np.median(after_s):.2f} s (median), {after_s.max():.2f} s (slowest)")
     lines += [
-        f"hips off the truth by {1e3 * report.usual_error_m:.0f} mm (median); largest step from "
+        f"hips off the truth by {1e3 * report.usual_error_m:.0f} mm (median), somebody followed "
+        f"wrongly for {report.longest_wrong_s:.2f} s at the longest; largest step from "
         f"one instant to the next {1e3 * report.worst_jump_m:.0f} mm; {report.not_finite} poses "
         "not finite",
         f"memory {resources.memory_mb[first]:.0f} MB after the warm-up, "

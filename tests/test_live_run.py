@@ -18,7 +18,7 @@ from fusecap.live.health import Incidents, Input, Meter
 from fusecap.live.inbox import Inbox
 from fusecap.live.latency import Arrivals, Histogram, LatencyBook
 from fusecap.live.recorder import RecordSwitch
-from fusecap.live.run import LiveOptions, LiveRun
+from fusecap.live.run import SOONEST_NS, LiveOptions, LiveRun
 from fusecap.live.status import Light
 from fusecap.recording.reader import Recording
 from fusecap.streams.output import StreamStatus
@@ -369,6 +369,26 @@ def test_what_the_session_does_not_have_is_refused():
     assert going.report is not None
     assert going.report.incident_count == 3
     assert all(isinstance(event, Tick) for event in engine.taken)
+
+
+def test_what_was_measured_after_it_came_is_left_out_and_told():
+    clock, engine = SessionClock(), FakeEngine()
+
+    def script(deliver, stopping):
+        for _ in range(5):
+            deliver(imu_sample(clock.now_ns() + 2 * SOONEST_NS))
+        deliver(imu_sample(clock.now_ns()))
+        stopping.wait()
+
+    source = FakeSource("imus", script)
+    with Going(make_run([source], engine=engine, clock=clock)) as going:
+        wait_for(lambda: any(isinstance(event, ImuSample) for event in engine.taken))
+    assert sum(isinstance(event, ImuSample) for event in engine.taken) == 1
+    assert source.counts.dropped == 5
+    assert going.report is not None
+    assert [i.what for i in going.report.incidents if "future" in i.what] == [
+        "imus: samples from the future are left out; see its clock"
+    ]
 
 
 def test_a_solver_that_falls_behind_leaves_instants_out():

@@ -45,6 +45,8 @@ _LOOK_S = 0.1
 _ROLL_S = 5
 _SHOWN = 20
 """Incidents in a status."""
+SOONEST_NS = 100_000_000
+"""A sample stamped so much later than it came is off: nothing is measured after it arrived."""
 _JOIN_S = 2.0
 """For all threads together, when the run ends."""
 
@@ -226,6 +228,10 @@ class LiveRun:
         source = self._inputs.get(key)
         if source is None:
             self._refuse(f"{feed.source.name} delivers for {key}, which the session does not have")
+            return
+        if item.timestamp_ns > now_ns + SOONEST_NS:
+            feed.source.counts.dropped += 1
+            self._refuse(f"{feed.source.name}: samples from the future are left out; see its clock")
             return
         source.arrived(now_ns)
         self._feed_of[key] = feed
