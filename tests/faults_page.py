@@ -56,6 +56,8 @@ is loose and its floor elsewhere.
 | | where | message | remedy | test |
 |---|---|---|---|---|
 """
+REPORTS = "\n## Public reports\n"
+"""Where what is written by hand begins."""
 _ERRORS = ("InputError", "SessionError", "CalibrationError")
 _LEAST_WORDS = 9
 """Characters of a message that a test must ask for."""
@@ -65,7 +67,8 @@ def page() -> str:
     """The text of the page."""
     tests = _asked_for()
     rows = {row: None for room in ROOMS for row in _rows(ROOT / "src/fusecap" / room)}
-    return HEAD + "".join(_line(row, tests) for row in rows)
+    by_hand = REPORTS + PAGE.read_text().partition(REPORTS)[2]
+    return HEAD + "".join(_line(row, tests) for row in rows) + by_hand
 
 
 Row = tuple[str, str, str, str]

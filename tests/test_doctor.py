@@ -152,7 +152,7 @@ def test_sound_imu_session_only_lacks_cameras(tmp_path):
         ([0, 0, 0.01], "gravity has been removed"),
         ([0, 9.8, 0], 'imu_up is z, gravity points along y: hips; set imu_up = "y"'),
         ([9.8, 0, 0], "90 deg away"),
-        ([0, 0, -9.8], "180 deg away"),
+        ([0, 0, -9.8], "gravity points along -z"),
     ],
 )
 def test_odd_accelerations_are_found(tmp_path, accel, expected):

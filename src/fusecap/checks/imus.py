@@ -12,10 +12,14 @@ from fusecap.geometry.quaternions import from_wxyz
 from fusecap.sources.imu_files.track import ImuTrack
 from fusecap.sources.session import ImuSettings, Session
 from fusecap.sources.session_sensors import mount
+from fusecap.sources.synchronizer import UPRIGHT
 from fusecap.types import GRAVITY_M_S2
 
 FROZEN_S = 0.5
-_OTHER_UP = {"y": "z", "z": "y"}
+_OR_SIGN = (
+    " where their worlds are north, east, down; where accelerometers read 9.8 downwards at rest, "
+    "multiply accelerations by -1 instead"
+)
 
 
 def check_imus(
@@ -41,18 +45,24 @@ def check_imus(
                     findings.add("error", where, str(error).removeprefix(f"{where}: "))
                     continue
             _check_imu(where, imu, track, findings)
-            if track.up_axis == _OTHER_UP[imu.imu_up]:
-                other_up.append(imu)
+            if _points_elsewhere(imu, track):
+                other_up.append((imu.imu_up, track.up_axis, imu.bone))
         if unmounted:
             _add_unmounted(subject.name, unmounted, bool(session.cameras), findings)
-        for up in {imu.imu_up: None for imu in other_up}:
-            bones = [imu.bone for imu in other_up if imu.imu_up == up]
+        for stated, found in {(stated, found): None for stated, found, _ in other_up}:
+            bones = [bone for *both, bone in other_up if both == [stated, found]]
             findings.add(
                 "warning",
                 f"sensors of '{subject.name}'",
-                f"imu_up is {up}, gravity points along {_OTHER_UP[up]}: {', '.join(bones)}",
-                f'set imu_up = "{_OTHER_UP[up]}" in their tables',
+                f"imu_up is {stated}, gravity points along {found}: {', '.join(bones)}",
+                f'set imu_up = "{found}" in their tables'
+                + (_OR_SIGN if "-z" in (stated, found) else ""),
             )
+
+
+def _points_elsewhere(imu: ImuSettings, track: ImuTrack) -> bool:
+    """Whether gravity's reaction points along another axis that may be called up."""
+    return track.up_axis in UPRIGHT and track.up_axis != imu.imu_up
 
 
 def _add_unmounted(subject: str, bones: list[str], cameras: bool, findings: Findings) -> None:
@@ -135,9 +145,9 @@ def _check_gravity(where: str, imu: ImuSettings, track: ImuTrack, findings: Find
             "export the raw acceleration (specific force)",
         )
     else:
-        up = np.array([0.0, 1.0, 0.0] if imu.imu_up == "y" else [0.0, 0.0, 1.0])
+        up = UPRIGHT[imu.imu_up][1]
         angle = np.degrees(np.arccos(np.clip(force @ up / np.linalg.norm(force), -1, 1)))
-        if angle > 15 and track.up_axis != _OTHER_UP[imu.imu_up]:
+        if angle > 15 and not _points_elsewhere(imu, track):
             findings.add(
                 "warning",
                 where,

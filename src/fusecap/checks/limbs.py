@@ -279,8 +279,9 @@ def _rate_remedy(rate: float, left_rad: float) -> str:
 
 def _heading_remedy(heading_rad: float, left_rad: float) -> str:
     return (
-        f"add about {np.degrees(heading_rad):+.0f} to their heading_deg: then "
-        f"{np.degrees(left_rad):.0f} deg are left; fusecap calibrate imu finds it exactly"
+        f"add about {np.degrees(heading_rad):+.0f} to their heading_deg, or to tpose_facing_deg "
+        f"where a T-pose calibrates them: then {np.degrees(left_rad):.0f} deg are left; fusecap "
+        "calibrate imu finds it exactly"
     )
 
 

@@ -1,9 +1,9 @@
 """Whether the cameras agree about the people in front of them, and if not, why.
 
 A camera that disagrees is late, or takes left for right, or its keypoints are of another
-resolution, or it was moved. Each of the first three is tried: what makes the disagreement fall to
-less than half is named, else it stays with the fourth. Of a late camera slow people tell nothing,
-so that is tried on the instants at which people are fastest.
+resolution or of turned pictures, or it was moved. Each of the first four is tried: what makes the
+disagreement fall to less than half is named, else it stays with the last. Of a late camera slow
+people tell nothing, so that is tried on the instants at which people are fastest.
 """
 
 from __future__ import annotations
@@ -36,6 +36,8 @@ SHIFT_RANGE_S = 1.0
 LEAST_SHIFT_S = 0.03
 RESOLUTIONS = (0.25, 1 / 3, 0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0, 3.0, 4.0)
 """Of one video over another's: 480, 540, 720, 1080, 1440 and 2160 lines."""
+TURNS_DEG = (90, 180, 270)
+"""Clockwise, of phones held upright, of cameras on their side."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -115,7 +117,7 @@ def check_views(views: ComparedViews, findings: Findings) -> None:
     pairs = views.disagreement_px(views.times_s)
     own = view_agreement.per_camera_px(pairs)
     fast = view_agreement.per_camera_px(views.disagreement_px(views.fast_s))
-    if _check_resolution(views, pairs, findings):
+    if _check_pictures(views, pairs, findings):
         return
     single = False
     for index in range(len(views.rig)):
@@ -173,6 +175,10 @@ def _cause(views: ComparedViews, index: int, own_px: float, fast_px: float) -> s
         scaled = _scaled(track, scale)
         left_px = views.with_track(index, scaled).own_px(index, views.times_s)
         causes.append((left_px / own_px, _resolution_remedy(views, index, scale, left_px)))
+    for turn_deg in TURNS_DEG:
+        back = _turned_back(track, views.rig.cameras[index].size_px, turn_deg)
+        left_px = views.with_track(index, back).own_px(index, views.times_s)
+        causes.append((left_px / own_px, _turn_remedy(track.name, turn_deg, left_px)))
     share, remedy = min(causes, key=lambda cause: _known(cause[0]))
     return remedy if share < EXPLAINED else None
 
@@ -201,6 +207,32 @@ def _scaled(track: KeypointTrack, scale: float) -> KeypointTrack:
     return replace(track, people=changed(track.people, lambda people: people * scales))
 
 
+def _turned_back(
+    track: KeypointTrack, size_px: tuple[int, int], clockwise_deg: int
+) -> KeypointTrack:
+    """Of pictures that were turned clockwise, as of the calibrated ones of this size."""
+    width, height = size_px
+
+    def back(people: np.ndarray) -> np.ndarray:
+        u, v, confidence = np.moveaxis(people, -1, 0)
+        old = {
+            90: (v, height - 1 - u),
+            180: (width - 1 - u, height - 1 - v),
+            270: (width - 1 - v, u),
+        }[clockwise_deg]
+        return np.stack([*old, confidence], axis=-1)
+
+    return replace(track, people=changed(track.people, back))
+
+
+def _turn_remedy(cameras: str, clockwise_deg: int, left_px: float) -> str:
+    return (
+        f"as of pictures turned clockwise by {clockwise_deg} deg {left_px:.0f} px are left: turn "
+        "them back and detect again, or turn the calibration: fusecap calibrate world --turned "
+        f"{cameras}={clockwise_deg}"
+    )
+
+
 def _resolution_remedy(views: ComparedViews, index: int, scale: float, left_px: float) -> str:
     width, height = views.rig.cameras[index].size_px
     return (
@@ -210,23 +242,34 @@ def _resolution_remedy(views: ComparedViews, index: int, scale: float, left_px: 
     )
 
 
-def _check_resolution(views: ComparedViews, pairs_px: np.ndarray, findings: Findings) -> bool:
-    """Whether keypoints of all views are of another resolution than their calibration."""
+def _check_pictures(views: ComparedViews, pairs_px: np.ndarray, findings: Findings) -> bool:
+    """Whether keypoints of all views are of other pictures than their calibration's."""
     typical_px = _median(pairs_px)
     if not views.share(0, typical_px) > NOTABLE_DISAGREEMENT_SHARE:
         return False
-    left = {}
+    causes = []
     for scale in RESOLUTIONS:
         scaled = replace(views, tracks=tuple(_scaled(track, scale) for track in views.tracks))
-        left[scale] = _median(scaled.disagreement_px(views.times_s))
-    best = min(left, key=lambda scale: _known(left[scale]))
-    if not left[best] < EXPLAINED * typical_px:
+        left_px = _median(scaled.disagreement_px(views.times_s))
+        causes.append((left_px, _resolution_remedy(views, 0, scale, left_px)))
+    for turn_deg in TURNS_DEG:
+        back = replace(
+            views,
+            tracks=tuple(
+                _turned_back(track, camera.size_px, turn_deg)
+                for track, camera in zip(views.tracks, views.rig.cameras, strict=True)
+            ),
+        )
+        left_px = _median(back.disagreement_px(views.times_s))
+        causes.append((left_px, _turn_remedy("CAMERA", turn_deg, left_px)))
+    left_px, remedy = min(causes, key=lambda cause: _known(cause[0]))
+    if not left_px < EXPLAINED * typical_px:
         return False
     findings.add(
         "warning",
         "calibration",
         f"cameras disagree by a median of {typical_px:.0f} px",
-        _resolution_remedy(views, 0, best, left[best]),
+        remedy,
     )
     return True
 

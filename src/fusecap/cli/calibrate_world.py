@@ -84,25 +84,33 @@ def world(
             help="board, points, or A,B=LENGTH: two cameras or marked points that far apart."
         ),
     ] = None,
+    turned: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="CAMERA=90, 180 or 270: its pictures were turned clockwise by so much since it "
+            "was calibrated; alone or with any way; repeat it."
+        ),
+    ] = None,
     up: Annotated[str, typer.Option(help="Up axis of the calibration as it is: y, z or -y.")] = "y",
-    unit: Annotated[str, typer.Option(help="Of the calibration, where open: m or mm.")] = "m",
+    unit: Annotated[str, typer.Option(help="Of the calibration, where open: m, cm or mm.")] = "m",
     as_json: Json = False,
 ) -> None:
     """Put calibrated cameras into the world: floor at y = 0, y up, and north where IMUs have it."""
     from fusecap.calibrate.cameras import world_frame as frame
+    from fusecap.geometry.similarity import Similarity
     from fusecap.sources.calibration_files import check_rig, load_rig, write_rig
     from fusecap.sources.marked_points import read_marked_points
 
     check_choice("--up", up, ("y", "z", "-y"))
-    check_choice("--unit", unit, ("m", "mm"))
+    check_choice("--unit", unit, ("m", "cm", "mm"))
     check_choice("--imu-up", imu_up, ("z", "y"))
     check_choice("--reference", reference, tuple(frame.REFERENCES))
     thickness_m = (
         0.0 if board_thickness == "0mm" else length_m("--board-thickness", board_thickness)
     )
-    _check_way(board, floor, points, floor_points, gravity, north)
+    _check_way(board, floor, points, floor_points, gravity, north, turned)
     bearing_deg = None if north in (None, "imu") else _degrees(north)
-    rig = load_rig(calibration, up=up, unit=unit)
+    rig = _turned(load_rig(calibration, up=up, unit=unit), turned or [])
     imu, body = _resting(gravity, imu_format, imu_sensor, imu_axes, imu_up, rig, board is not None)
 
     file = points or floor_points
@@ -128,7 +136,7 @@ def world(
         elif up_in_old is not None:
             placement = frame.from_gravity(up_in_old)
         else:
-            raise _no_way()
+            placement = frame.NewWorld(change=Similarity(), how="the calibration's own")
     change = placement.change.after(change)
     if bearing_deg is not None:
         change = frame.to_north(bearing_deg, reference).after(change)
@@ -150,7 +158,7 @@ def world(
 
 def _no_way() -> typer.BadParameter:
     return typer.BadParameter(
-        "give one of --board with --floor, --points, --floor-points, --gravity; "
+        "give one of --board with --floor, --points, --floor-points, --gravity, --turned; "
         "--gravity also goes with --board or --floor-points"
     )
 
@@ -162,9 +170,10 @@ def _check_way(
     floor_points: Path | None,
     gravity: str | None,
     north: str | None,
+    turned: list[str] | None,
 ) -> None:
     ways = [board, points, floor_points]
-    if sum(way is not None for way in ways) > 1 or (gravity is None and not any(ways)):
+    if sum(way is not None for way in ways) > 1 or not (gravity or turned or any(ways)):
         raise _no_way()
     if (board is None) != (not floor):
         raise typer.BadParameter("--board and --floor go together: what lies there, and its images")
@@ -172,6 +181,17 @@ def _check_way(
         raise typer.BadParameter("--points say what is up already; leave out --gravity")
     if north == "imu" and gravity is None:
         raise typer.BadParameter("--north imu needs the IMU of --gravity")
+
+
+def _turned(rig: Rig, turned: list[str]) -> Rig:
+    """Of cameras whose pictures were turned since they were calibrated."""
+    from fusecap.geometry.camera import Rig
+
+    degrees = named_once("--turned", turned, "CAMERA=90, 180 or 270")
+    for name, text in degrees.items():
+        check_choice("--turned", text, ("90", "180", "270"))
+        rig[name]
+    return Rig(cameras=tuple(c.turned(int(degrees.get(c.name, "0"))) for c in rig.cameras))
 
 
 def _degrees(text: str | None) -> float:

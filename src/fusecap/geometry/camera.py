@@ -79,6 +79,25 @@ class Camera:
         """Centre of projection [m]."""
         return -self.rotation.T @ self.translation
 
+    def turned(self, clockwise_deg: int) -> Camera:
+        """The same view of pictures that were turned clockwise by 0, 90, 180 or 270 degrees."""
+        if clockwise_deg == 0:
+            return self
+        quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+        (width, height), (fx, fy) = self.size_px, np.diag(self.matrix)[:2]
+        k1, k2, p1, p2, k3 = self.distortion
+        once = Camera(
+            name=self.name,
+            size_px=(height, width),
+            matrix=np.array(
+                [[fy, 0.0, height - 1 - self.matrix[1, 2]], [0.0, fx, self.matrix[0, 2]], [0, 0, 1]]
+            ),
+            distortion=np.array([k1, k2, p2, -p1, k3]),
+            rotation=quarter @ self.rotation,
+            translation=quarter @ self.translation,
+        )
+        return once.turned(clockwise_deg - 90)
+
     @property
     def pixel_scale(self) -> float:
         """Multiplies residuals, see `REFERENCE_WIDTH_PX`."""

@@ -18,6 +18,8 @@ from fusecap.sources.video import VIDEO_SUFFIXES
 
 DEEPEST = 3
 """Folders below the surveyed one."""
+WIDEST_IN_CM_M = 15.0
+"""Between cameras: farther apart in centimetres they are taken to be in millimetres."""
 
 _MADE = re.compile(
     r"[_-]?(?P<own>overlay)s?$|[_-](drawn|pose|openpose|rendered|skeleton|keypoints|labeled|annotated)$",
@@ -56,6 +58,8 @@ class FolderSurvey:
     """That of all cameras, as the number of values tells."""
     calibration: Path | None
     """The one that places the cameras best."""
+    calibration_unit: str
+    """In which its cameras stand in a room."""
     other_calibrations: tuple[Path, ...]
     cameras: tuple[str, ...]
     """Of the calibration."""
@@ -77,7 +81,7 @@ def survey(folder: Path) -> FolderSurvey:
         if file.suffix == ".json" and re.search(r"\d(_keypoints)?$", file.stem):
             name = _DECORATION.sub("", file.parent.name) or file.parent.name
             keypoints.setdefault(name, file.parent.relative_to(folder))
-    calibration, others, cameras = _calibration(folder, files)
+    calibration, unit, others, cameras = _calibration(folder, files)
     videos, made = _videos(folder, files)
     return FolderSurvey(
         folder=folder,
@@ -86,6 +90,7 @@ def survey(folder: Path) -> FolderSurvey:
         keypoints=keypoints,
         keypoint_format=_keypoint_format(folder, keypoints),
         calibration=calibration,
+        calibration_unit=unit,
         other_calibrations=others,
         cameras=cameras,
         sensors=_sensors(folder, files),
@@ -123,29 +128,31 @@ def _files(folder: Path, depth: int) -> Iterator[Path]:
 
 def _calibration(
     folder: Path, files: list[Path]
-) -> tuple[Path | None, tuple[Path, ...], tuple[str, ...]]:
-    """What places the cameras best, the others that could be read, and its cameras.
+) -> tuple[Path | None, str, tuple[Path, ...], tuple[str, ...]]:
+    """What places the cameras best, its unit, the others that could be read, and its cameras.
 
     Lenses alone leave all cameras at one point; of files that place them, the one written last
     has had its floor found last.
     """
-    readable: list[tuple[tuple[bool, bool, int, float], Path, tuple[str, ...]]] = []
+    readable: list[tuple[tuple[bool, bool, int, float], Path, str, tuple[str, ...]]] = []
     for file in (file for file in files if may_be_calibration(file)):
-        for unit in ("m", "mm"):
+        for unit in ("m", "cm", "mm"):
             try:
                 rig = load_rig(file, unit=unit)
             except FusecapError:
                 continue
+            if unit == "cm" and camera_spread(rig) > WIDEST_IN_CM_M:
+                continue
             placed = len(rig) < 2 or camera_spread(rig) > SAME_PLACE_M
             world = "world" in file.stem.lower()
             rank = (placed, world, -len(file.parts), file.stat().st_mtime)
-            readable.append((rank, file.relative_to(folder), rig.names))
+            readable.append((rank, file.relative_to(folder), unit, rig.names))
             break
     if not readable:
-        return None, (), ()
+        return None, "m", (), ()
     readable.sort(key=lambda item: item[0], reverse=True)
-    _, best, names = readable[0]
-    return best, tuple(path for _, path, _ in readable[1:]), names
+    _, best, unit, names = readable[0]
+    return best, unit, tuple(path for _, path, *_ in readable[1:]), names
 
 
 def _keypoint_format(folder: Path, keypoints: dict[str, Path]) -> str | None:

@@ -168,7 +168,7 @@ class SessionSettings(_Table):
     rate_hz: Positive = 60.0
     """Of the solve."""
     calibration: File | None = None
-    calibration_unit: Annotated[str, _one_of(["m", "mm"])] = "m"
+    calibration_unit: Annotated[str, _one_of(["m", "cm", "mm"])] = "m"
     """Of calibration files whose format leaves the unit open."""
     up: Annotated[str, _one_of(["y", "z", "-y"])] = "y"
     """The axis of the calibration's world that points up."""
@@ -266,8 +266,8 @@ class ImuSettings(_Table):
     """The sensor in the bone's frame."""
     heading_deg: Number = 0.0
     """Rotation about world up that turns the sensor's reference world into ours."""
-    imu_up: Annotated[str, _one_of(["y", "z"])] = "z"
-    """The up axis of the sensor's reference world."""
+    imu_up: Annotated[str, _one_of(["y", "z", "-z"])] = "z"
+    """The up axis of the sensor's reference world; "-z" is north, east, down."""
 
     @model_validator(mode="after")
     def _has_a_source(self) -> ImuSettings:

@@ -28,6 +28,11 @@ def draft(found: FolderSurvey, networks: Mapping[str, str] = MappingProxyType({}
     lines = ["[session]", f"name = {quoted(found.folder.resolve().name)}"]
     if found.calibration is not None:
         lines.append(f"calibration = {quoted(found.calibration.as_posix())}{_why(found)}")
+        if found.calibration_unit != "m":
+            lines.append(
+                f"calibration_unit = {quoted(found.calibration_unit)}   # in metres its cameras "
+                "would not stand in a room"
+            )
         if found.calibration.name.endswith((".qca.txt", ".qca")):
             lines.append('up = "z"   # as Qualisys has it')
     elif found.videos or found.keypoints:
@@ -93,6 +98,8 @@ def _subject(found: FolderSurvey) -> Iterator[str]:
             yield f"{mark}sensor = {quoted(sensor.sensor)}"
         if sensor.up == "y":
             yield f'{mark}imu_up = "y"   # its accelerations point there'
+        if sensor.up == "-z":
+            yield f'{mark}# imu_up = "-z"   # where its world is north, east, down'
         if known:
             taken.add(str(sensor.bone))
 

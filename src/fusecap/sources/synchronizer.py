@@ -155,10 +155,13 @@ class MountedImu:
     """(3,) t_ib."""
 
 
+UPRIGHT = {"y": np.eye(3), "z": Y_UP_FROM_Z_UP, "-z": Y_UP_FROM_Z_UP.T}
+"""Rotates a sensor's reference world into one that is y up, by its up axis; x stays."""
+
+
 def world_from_imu_world(imu_up: str, heading_deg: float) -> np.ndarray:
-    """R_ig: the reference world's up axis ("y" or "z") onto ours, then turned about it."""
-    upright = Y_UP_FROM_Z_UP if imu_up == "z" else np.eye(3)
-    return Rotation.from_euler("y", heading_deg, degrees=True).as_matrix() @ upright
+    """R_ig: the reference world's up axis, of `UPRIGHT`, onto ours, then turned about it."""
+    return Rotation.from_euler("y", heading_deg, degrees=True).as_matrix() @ UPRIGHT[imu_up]
 
 
 def resample_imus(imus: Sequence[MountedImu], times_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

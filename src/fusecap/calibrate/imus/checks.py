@@ -15,7 +15,7 @@ from fusecap.calibrate.imus.tpose import TPose
 from fusecap.errors import InputError
 from fusecap.sources.imu_files.track import ImuTrack
 from fusecap.sources.session import ImuSettings
-from fusecap.sources.synchronizer import MountedImu, resample_imus, world_from_imu_world
+from fusecap.sources.synchronizer import UPRIGHT, MountedImu, resample_imus, world_from_imu_world
 
 MIN_OVERLAP_S = 6.0
 MAX_LAG_S = 0.1
@@ -88,7 +88,7 @@ def _wrong_up(worn: Worn) -> str:
     found = worn.track.up_axis
     if found is None or found == worn.settings.imu_up:
         return ""
-    hint = f'set imu_up = "{found}"' if found in ("y", "z") else "check the axes of its file"
+    hint = f'set imu_up = "{found}"' if found in UPRIGHT else "check the axes of its file"
     return (
         f'gravity points along {found} of its reference world, imu_up is "{worn.settings.imu_up}"; '
         f"{hint}"

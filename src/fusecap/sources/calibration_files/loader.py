@@ -22,6 +22,7 @@ Y_UP_FROM = {
     "-y": np.diag([1.0, -1.0, -1.0]),
 }
 """Per up axis of a calibration's world, the rotation that brings it into ours."""
+PER_METRE = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
 _PICKLES, _OPENCV = (".pickle", ".pkl"), (".yml", ".yaml", ".xml")
 
 
@@ -32,7 +33,7 @@ def load_rig(
 
     With `names` only those; the others may be of any kind and unfinished.
 
-    `up` is the up axis of the file's world ("y", "z" or "-y"). `unit` ("m" or "mm") is that of
+    `up` is the up axis of the file's world ("y", "z" or "-y"). `unit` (of `PER_METRE`) is that of
     formats which leave it open; centimetres of Panoptic and millimetres of Qualisys are known.
     Raises `CalibrationError`, also for a calibration that is evidently not in the stated unit.
     """
@@ -51,8 +52,10 @@ def load_rig(
             f"{path}: no camera {', '.join(map(repr, missing))}; "
             f"it has {', '.join(name for name, _ in stated)}"
         )
-    if unit_is_open and unit == "mm":
-        cameras = [replace(camera, translation=camera.translation / 1000) for camera in cameras]
+    if unit_is_open and unit != "m":
+        cameras = [
+            replace(camera, translation=camera.translation / PER_METRE[unit]) for camera in cameras
+        ]
     try:
         rig = Rig(cameras=tuple(cameras)).in_world(Y_UP_FROM[up])
     except CalibrationError as error:
@@ -60,13 +63,14 @@ def load_rig(
     spread = camera_spread(rig)
     if spread > MILLIMETRES_ABOVE:
         raise CalibrationError(
-            f"{path}: the cameras stand {spread:.0f} m apart, expected a room in metres; if the "
-            'file is in millimetres, write calibration_unit = "mm" under [session]'
+            f"{path}: the cameras stand {spread:.0f} m apart, expected a room in metres; "
+            f'write calibration_unit = "mm" under [session] if {spread / 1000:.2f} m is right, '
+            f'"cm" if {spread / 100:.2f} m is'
         )
-    if unit_is_open and unit == "mm" and len(rig) > 1 and spread < MILLIMETRES_ABOVE / 1000:
+    if unit_is_open and unit != "m" and len(rig) > 1 and spread < MILLIMETRES_ABOVE / 1000:
         raise CalibrationError(
-            f"{path}: read in millimetres the cameras stand {spread * 1000:.1f} mm apart; the "
-            "file is in metres already: remove calibration_unit from [session]"
+            f"{path}: read in {unit} the cameras stand {spread * 1000:.1f} mm apart; the file is "
+            "in metres already: remove calibration_unit from [session]"
         )
     return rig
 

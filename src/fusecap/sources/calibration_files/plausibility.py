@@ -10,6 +10,8 @@ from fusecap.geometry.camera import Rig
 MILLIMETRES_ABOVE = 100.0
 """Cameras whose median distance exceeds this are not given in metres."""
 SAME_PLACE_M = 0.005
+NARROW_M = 0.03
+"""Nearer to each other than the lenses of a stereo camera."""
 BELOW_FLOOR_M = -0.3
 
 
@@ -34,6 +36,17 @@ def check_rig(rig: Rig, *, floor: bool = True) -> list[Finding]:
                 where="calibration",
                 found="all cameras stand at the same place: it holds their lenses only",
                 remedy="fusecap calibrate extrinsics places them; name what it wrote",
+            )
+        ]
+    if len(rig) > 1 and camera_spread(rig) < NARROW_M:
+        return [
+            Finding(
+                severity="error",
+                where="calibration",
+                found=f"its cameras stand within {1e3 * camera_spread(rig):.0f} mm of each other",
+                remedy="where they stand farther apart it is in another unit, or its extrinsics "
+                "failed whatever their error says: fusecap calibrate extrinsics, with the board "
+                "all over the room",
             )
         ]
     for i, first in enumerate(names):
