@@ -144,6 +144,13 @@ def _check_gravity(where: str, imu: ImuSettings, track: ImuTrack, findings: Find
             f"the accelerometer reads {size:.1f} m/s2 on average: gravity has been removed",
             "export the raw acceleration (specific force)",
         )
+    elif size > 14:
+        findings.add(
+            "warning",
+            where,
+            f"the accelerometer reads {size:.1f} m/s2 on average, gravity is {GRAVITY_M_S2:.1f}",
+            "see in which unit or range it was recorded; expected m/s2",
+        )
     else:
         up = UPRIGHT[imu.imu_up][1]
         angle = np.degrees(np.arccos(np.clip(force @ up / np.linalg.norm(force), -1, 1)))

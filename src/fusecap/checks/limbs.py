@@ -10,27 +10,21 @@ landmark tells.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from fusecap.associate.sensor_vote import MIN_LIMBS, limbs_of
-from fusecap.checks.views import ComparedViews
-from fusecap.errors import FusecapError
+from fusecap.checks.wearers import LEAST_INSTANTS, Wearer, median_angle
 from fusecap.findings import Findings
-from fusecap.sources.imu_files.track import ImuTrack
-from fusecap.sources.session import Session
-from fusecap.sources.session_sensors import mount
 from fusecap.sources.synchronizer import MountedImu, resample_imus
 
 APART_RAD = np.radians(22.0)
 EXPLAINED = 0.5
 LEAST_GAIN_RAD, LEAST_GAIN_ALONE_RAD = np.radians(3.0), np.radians(6.0)
 """Of all sensors of a person, of one: less is within what bodies and landmarks differ by."""
-LEAST_INSTANTS = 10
 SHIFTS_S = np.arange(-30, 31) * 0.05
 NEAR_S = SHIFTS_S[np.abs(SHIFTS_S) < 0.625]
 """Of one sensor alone: who walks does the same a second later."""
@@ -39,76 +33,17 @@ RATES = (0.5, 0.6, 5 / 6, 1.2, 5 / 3, 2.0)
 SURER = 0.7
 """Of what anything else leaves, before another rate is believed."""
 HEADINGS_RAD = np.radians(np.arange(-170, 181, 10))
-DRIFT_RAD = np.radians(15.0)
-"""Between the headings of the first and of the second half."""
+DRIFT_RAD = np.radians(8.0)
+"""Between the headings of the first and of the second half; 3 in right sessions."""
+LEVEL = 0.3
+"""Sine of a limb's angle to up, from which on it tells a heading."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Worn:
-    """One person's sensors, against people as cameras see them."""
-
-    name: str
-    imus: tuple[MountedImu, ...]
-    times_s: Float[np.ndarray, " t"]
-    limbs: Int[np.ndarray, "l 3"]
-    rest: Float[np.ndarray, "l 3"]
-    seen: Float[np.ndarray, "t p l 3"]
-    """Where everybody's limbs point; NaN where not seen."""
-
-    def shifted(self) -> Float[np.ndarray, "s t l 3"]:
-        """`turned` at the instants, later by each of `SHIFTS_S`."""
-        times_s = (self.times_s - SHIFTS_S[:, None]).ravel()
-        return self.turned(times_s).reshape(len(SHIFTS_S), len(self.times_s), -1, 3)
-
-    def turned(self, times_s: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n l 3"]:
-        """Where limbs point by their sensors."""
-        rotations, _ = resample_imus(self.imus, times_s)
-        return np.einsum("tlij,lj->tli", rotations[:, self.limbs[:, 0]], self.rest)
-
-    def own(self, turned: Float[np.ndarray, "t l 3"]) -> Float[np.ndarray, "t l 3"]:
-        """Limbs of whoever fits best at each instant; NaN where nobody can be told."""
-        cosine = np.einsum("tpli,tli->tpl", self.seen, turned)
-        known = np.isfinite(cosine)
-        count = known.sum(axis=2)
-        off = np.where(known, 1.0 - cosine, 0.0).sum(axis=2) / np.maximum(count, 1)
-        off[count < MIN_LIMBS] = np.inf
-        best = off.argmin(axis=1)
-        every = np.arange(len(off))
-        told = np.isfinite(off[every, best])
-        return np.where(told[:, None, None], self.seen[every, best], np.nan)
-
-    def per_sensor(
-        self, own: Float[np.ndarray, "t l 3"], turned: Float[np.ndarray, "t l 3"]
-    ) -> Float[np.ndarray, " i"]:
-        """Median angles [rad]; NaN for sensors that too few instants tell of."""
-        cosine = np.einsum("tli,tli->tl", own, turned)
-        return np.array(
-            [_median_angle(cosine[:, self.limbs[:, 0] == i]) for i in range(len(self.imus))]
-        )
-
-
-def _median_angle(cosine: np.ndarray) -> float:
-    known = cosine[np.isfinite(cosine)]
-    if len(known) < LEAST_INSTANTS:
-        return float("nan")
-    return float(np.arccos(np.clip(np.median(known), -1.0, 1.0)))
-
-
-def check_limbs(
-    session: Session,
-    views: ComparedViews,
-    imus: Mapping[str, Sequence[ImuTrack | None]],
-    findings: Findings,
-) -> None:
-    """Of people who wear sensors on three limbs or more that cameras see."""
-    everybody = [
-        worn
-        for subject in session.subjects
-        if (worn := _worn(session, subject.name, imus.get(subject.name, ()), views)) is not None
-    ]
+def check_limbs(wearers: Sequence[Wearer], findings: Findings) -> set[str]:
+    """The sensors that it names."""
     alone: list[_Sensor] = []
-    for worn in everybody:
-        shifted = worn.shifted()
+    for worn in wearers:
+        shifted = worn.shifted(SHIFTS_S)
         turned = shifted[SHIFTS_S.tolist().index(0.0)]
         own = worn.own(turned)
         apart = worn.per_sensor(own, turned)
@@ -130,48 +65,15 @@ def check_limbs(
                 )
             )
     exchanged = _check_exchanged([s for s in alone if s.apart_rad > APART_RAD], findings)
+    told = set(exchanged)
     for sensor in alone:
-        if sensor.where not in exchanged:
-            _check_one(sensor, findings)
-
-
-def _worn(
-    session: Session,
-    name: str,
-    tracks: Sequence[ImuTrack | None],
-    views: ComparedViews,
-) -> _Worn | None:
-    subject = next(subject for subject in session.subjects if subject.name == name)
-    mounted: list[MountedImu] = []
-    for imu, track in zip(subject.imus, tracks, strict=True):
-        if track is not None:
-            try:
-                mounted += mount(subject.model_copy(update={"imus": (imu,)}), [track])
-            except FusecapError:  # told where sensors are checked
-                continue
-    limbs, rest = limbs_of(views.tracks[0].landmarks, [imu.bone for imu in mounted])
-    if len(limbs) < MIN_LIMBS:
-        return None
-    most = max(map(len, views.people))
-    seen = np.full((len(views.times_s), most, len(limbs), 3), np.nan)
-    for row, people in enumerate(views.people):
-        along = people[:, limbs[:, 2]] - people[:, limbs[:, 1]]
-        length = np.linalg.norm(along, axis=2, keepdims=True)
-        seen[row, : len(people)] = along / np.maximum(length, 1e-9)
-    if most == 0:
-        return None
-    return _Worn(
-        name=name,
-        imus=tuple(mounted),
-        times_s=views.times_s,
-        limbs=limbs,
-        rest=rest,
-        seen=seen,
-    )
+        if sensor.where not in exchanged and _check_one(sensor, findings):
+            told.add(sensor.where)
+    return told
 
 
 def _together(
-    worn: _Worn,
+    worn: Wearer,
     shifted: Float[np.ndarray, "s t l 3"],
     turned: Float[np.ndarray, "t l 3"],
     apart: Float[np.ndarray, " i"],
@@ -197,7 +99,7 @@ def _together(
     left_rad, remedy = min(causes, key=lambda cause: cause[0])
     if not _explains(left_rad, typical, LEAST_GAIN_RAD):
         drift_rad = _drift_rad(worn, turned)
-        if abs(drift_rad) < DRIFT_RAD:
+        if not abs(drift_rad) > DRIFT_RAD:
             return None
         remedy = _drift_remedy(drift_rad)
     return f"point {np.degrees(typical):.0f} deg away from the limbs that cameras see", remedy
@@ -222,11 +124,12 @@ class _Sensor:
 
     def left(self, turned: np.ndarray) -> float:
         """Median angle [rad]; infinite where too little is known."""
-        angle = _median_angle(np.einsum("tli,tli->tl", self.own, turned))
+        angle = median_angle(np.einsum("tli,tli->tl", self.own, turned))
         return angle if np.isfinite(angle) else np.inf
 
 
-def _check_one(sensor: _Sensor, findings: Findings) -> None:
+def _check_one(sensor: _Sensor, findings: Findings) -> bool:
+    """Whether something was found."""
     late = _late(NEAR_S, [sensor.left(turned) for turned in sensor.shifted], "its")
     if late and _explains(late[0][0], sensor.apart_rad, LEAST_GAIN_ALONE_RAD):
         remedy = late[0][1]
@@ -236,13 +139,14 @@ def _check_one(sensor: _Sensor, findings: Findings) -> None:
             "slipped; fusecap calibrate imu finds how it sits and where its world faces"
         )
     else:
-        return
+        return False
     findings.add(
         "warning",
         sensor.where,
         f"points {np.degrees(sensor.apart_rad):.0f} deg away from the limb that cameras see",
         remedy,
     )
+    return True
 
 
 def _explains(left_rad: float, apart_rad: float, least_rad: float) -> bool:
@@ -292,19 +196,23 @@ def _drift_remedy(drift_rad: float) -> str:
     )
 
 
-def _drift_rad(worn: _Worn, turned: Float[np.ndarray, "t l 3"]) -> float:
-    """By how much the heading of the second half differs from that of the first, if it does."""
+def _drift_rad(worn: Wearer, turned: Float[np.ndarray, "t l 3"]) -> float:
+    """By how much the heading of the second half differs from that of the first."""
     own, half = worn.own(turned), len(turned) // 2
-    found = []
-    for rows in (slice(None, half), slice(half, None)):
-        headings = (0.0, *HEADINGS_RAD.tolist())
-        left = [
-            _median(worn.per_sensor(own[rows], _about_up(heading, turned[rows])))
-            for heading in headings
-        ]
-        best = int(np.argmin(left))
-        found.append(headings[best] if _explains(left[best], left[0], LEAST_GAIN_RAD) else 0.0)
-    return float(np.angle(np.exp(1j * (found[1] - found[0]))))
+    first, second = (
+        _heading_rad(own[rows], turned[rows]) for rows in (slice(None, half), slice(half, None))
+    )
+    return float(np.angle(np.exp(1j * (second - first))))
+
+
+def _heading_rad(own: Float[np.ndarray, "t l 3"], turned: Float[np.ndarray, "t l 3"]) -> float:
+    """From limbs as sensors turn them to those seen, about up: the median of those not upright."""
+    seen, said = own[..., 2] + 1j * own[..., 0], turned[..., 2] + 1j * turned[..., 0]
+    between = (seen * np.conj(said))[np.isfinite(seen) & (np.abs(said) > LEVEL)]
+    if len(between) < LEAST_INSTANTS:
+        return float("nan")
+    mean = np.angle(between.sum())
+    return float(mean + np.median(np.angle(between * np.exp(-1j * mean))))
 
 
 def _median(values: Float[np.ndarray, " i"]) -> float:

@@ -7,10 +7,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from fusecap.checks.imus import check_imus
+from fusecap.checks.joints import check_joints
 from fusecap.checks.keypoints import check_keypoints, check_lengths
 from fusecap.checks.limbs import check_limbs
 from fusecap.checks.people import check_people
+from fusecap.checks.sizes import check_sizes
 from fusecap.checks.views import ComparedViews, check_views
+from fusecap.checks.wearers import wearers
 from fusecap.findings import Findings
 from fusecap.geometry.camera import Rig
 from fusecap.sources.imu_files.track import ImuTrack
@@ -55,10 +58,14 @@ def check_motion(
     check_keypoints(session, {track.name: track for track in keypoints}, rig, findings)
     check_imus(session, imus, findings)
     views = None if rig is None else ComparedViews.of(rig, keypoints)
+    told = {finding.where for finding in findings}
     if views is not None:
         check_views(views, findings)
         check_people(session, views, findings)
-        check_limbs(session, views, imus, findings)
+        worn = wearers(session, views, imus)
+        check_sizes(session, views, worn, findings)
+        told |= check_limbs(worn, findings)
+    check_joints(session, imus, told, findings)
 
 
 def _check_rate(session: Session, findings: Findings) -> None:

@@ -102,26 +102,26 @@ def _add_tilted(session: Session, direction: np.ndarray, findings: Findings) -> 
 def _check_stature(
     session: Session, people: np.ndarray, landmarks: LandmarkSet, findings: Findings
 ) -> None:
-    stature_m = _stature_m(people, landmarks)
-    if not np.isfinite(stature_m):
+    seen_m = stature_m(people, landmarks)
+    if not np.isfinite(seen_m):
         return
-    stated = [m for m in map(_stated_stature_m, session.subjects) if m is not None]
-    if not STATURES_M[0] <= stature_m <= STATURES_M[1]:
+    stated = [m for m in map(stated_stature_m, session.subjects) if m is not None]
+    if not STATURES_M[0] <= seen_m <= STATURES_M[1]:
         findings.add(
             "warning",
             "calibration",
-            f"people are {stature_m:.2f} m tall, as their limbs measure",
+            f"people are {seen_m:.2f} m tall, as their limbs measure",
             "the calibration is not in metres: fusecap calibrate world scales it",
         )
     elif stated and len(stated) == len(session.subjects):
-        nearest_m = min(stated, key=lambda m: abs(np.log(stature_m / m)))
-        factor = stature_m / nearest_m
+        nearest_m = min(stated, key=lambda m: abs(np.log(seen_m / m)))
+        factor = seen_m / nearest_m
         off = abs(factor - 1) > STATED_TOLERANCE
         if off and _share_near(people, landmarks, stated) < NEAR_SHARE:
             findings.add(
                 "warning",
                 "calibration",
-                f"limbs measure as of people {stature_m:.2f} m tall, the session states "
+                f"limbs measure as of people {seen_m:.2f} m tall, the session states "
                 f"{nearest_m:.2f} m",
                 f"height_m or bone lengths are wrong, or the calibration is {factor:.2f} times too "
                 "large: fusecap calibrate world scales it",
@@ -131,13 +131,13 @@ def _check_stature(
 def _share_near(people: np.ndarray, landmarks: LandmarkSet, stated: list[float]) -> float:
     """Of people at an instant, how many are about as tall as somebody is stated to be."""
     some = people[:: -(-len(people) // MOST_MEASURED)]
-    each_m = np.array([_stature_m(one[None], landmarks, least=1) for one in some])
+    each_m = np.array([stature_m(one[None], landmarks, least=1) for one in some])
     each_m = each_m[np.isfinite(each_m), None]
     off = np.abs(each_m / np.array(stated) - 1.0).min(axis=1)
     return float((off <= STATED_TOLERANCE).mean()) if len(off) else 0.0
 
 
-def _stature_m(people: np.ndarray, landmarks: LandmarkSet, least: int = LEAST_PEOPLE) -> float:
+def stature_m(people: np.ndarray, landmarks: LandmarkSet, least: int = LEAST_PEOPLE) -> float:
     """Median over limbs of the stature that they have in the reference proportions."""
     unit = _unit_lengths()
     found = []
@@ -164,7 +164,7 @@ def _bone(landmark: str) -> int:
     return PAPER21.bone(LANDMARKS[f"left_{landmark}"][0])
 
 
-def _stated_stature_m(subject: SubjectSettings) -> float | None:
+def stated_stature_m(subject: SubjectSettings) -> float | None:
     if subject.height_m is not None:
         return subject.height_m
     unit = _unit_lengths()
