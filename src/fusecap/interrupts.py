@@ -6,6 +6,7 @@ that says when, too. Work that goes by instants or frames holds it, and asks bet
 
 from __future__ import annotations
 
+import atexit
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -15,11 +16,24 @@ _ENDS = ("SIGINT", "SIGTERM", "SIGHUP")
 
 
 def ends_are_ctrl_c() -> None:
-    """SIGTERM and SIGHUP do what Ctrl-C does, unless somebody ignores or handles them."""
-    for name in _ENDS[1:]:
-        number = getattr(signal, name, None)  # Windows knows no SIGHUP
-        if number is not None and signal.getsignal(number) is signal.SIG_DFL:
+    """SIGTERM and SIGHUP do what Ctrl-C does, unless somebody ignores or handles them.
+
+    Once this program is done, and only Python has to go, none of them takes its exit code away.
+    """
+    for number in _ends()[1:]:
+        if signal.getsignal(number) is signal.SIG_DFL:
             signal.signal(number, signal.default_int_handler)
+    atexit.register(_ignore_ends)
+
+
+def _ignore_ends() -> None:
+    for number in _ends():
+        signal.signal(number, signal.SIG_IGN)
+
+
+def _ends() -> list[int]:
+    """Windows knows no SIGHUP."""
+    return [getattr(signal, name) for name in _ENDS if hasattr(signal, name)]
 
 
 class Interruption:
@@ -43,8 +57,7 @@ def ctrl_c_held() -> Iterator[Interruption]:
     main one, in workers that ignore it, in programs with handlers of their own. Within another of
     these the interruption is that one's.
     """
-    numbers = [getattr(signal, name) for name in _ENDS if hasattr(signal, name)]
-    handlers = {number: signal.getsignal(number) for number in numbers}
+    handlers = {number: signal.getsignal(number) for number in _ends()}
     outer = [handler for handler in handlers.values() if isinstance(handler, Interruption)]
     if outer:
         yield outer[0]

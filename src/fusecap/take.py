@@ -287,8 +287,9 @@ def take_from_theta(
     position = np.full((s, t, b, 3), np.nan)
     quaternion = np.full((s, t, b, 4), np.nan)
     for subject, shape in enumerate(shapes):
-        frames = tracked[subject]
-        if frames.any():
+        known = np.flatnonzero(tracked[subject])
+        for first in range(0, len(known), BLOCK):
+            frames = known[first : first + BLOCK]
             position[subject, frames], rotation = forward_kinematics(shape, theta[subject, frames])
             quaternion[subject, frames] = _wxyz_from_matrix(rotation)
     return Take(

@@ -78,11 +78,12 @@ def edit(
         floor_shift_m=_signed_m(floor_shift),
     )
     with opened_take(take, note) as opened:
-        original = opened.of_frames(0, len(opened.timestamps_ns))
-    edited = edit_take(original, options)
+        earlier = len(opened.provenance.get("edits", ()))
+        # Nobody else holds the whole take: what an edit replaces is let go of.
+        edited = edit_take(opened.of_frames(0, len(opened.timestamps_ns)), options)
     save_take(edited, target)
     set_aside_earlier(target, [])
-    edits = list(edited.provenance["edits"])[len(original.provenance.get("edits", ())) :]
+    edits = list(edited.provenance["edits"])[earlier:]
     if as_json:
         print_json({"files": [str(target)], "edits": edits})
         return
