@@ -33,9 +33,10 @@ LATE_DISAGREEMENT_SHARE, LATE_OVER_OTHERS = 0.0024, 1.25
 """The same of a camera that a shift in time makes agree, and over the others' median."""
 EXPLAINED = 0.5
 """A cause is named that leaves less than this of a disagreement."""
-EXPLAINED_BY_TIME = 0.75
-"""The same of a shift, at instants that did not choose it. Right cameras, simulated and recorded,
-keep 0.85 or more, and nearly all of them want no shift."""
+EXPLAINED_BY_TIME, AS_OTHERS = 0.75, 1.3
+"""The same of a shift, at instants that did not choose it, that leaves no more than this of what
+others disagree by. Right cameras, simulated and recorded, keep 0.85 or more, and nearly all of them
+want no shift."""
 SHIFT_RANGE_S = 1.0
 LEAST_SHIFT_S = 0.03
 RESOLUTIONS = (0.25, 1 / 3, 0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0, 3.0, 4.0)
@@ -134,7 +135,7 @@ def check_views(views: ComparedViews, findings: Findings) -> None:
         )
         if not (grave or maybe_late):
             continue
-        told = _cause(views, index, own[index])
+        told = _cause(views, index, own[index], _median_of_others(fast, index))
         if told is None and grave:
             told = (
                 "if it was moved: fusecap calibrate extrinsics, --from-people without a board; "
@@ -161,7 +162,7 @@ def _median_of_others(values: np.ndarray, index: int) -> float:
     return float(np.median(others)) if len(others) else np.inf
 
 
-def _cause(views: ComparedViews, index: int, own_px: float) -> str | None:
+def _cause(views: ComparedViews, index: int, own_px: float, others_px: float) -> str | None:
     """The remedy for the one cause that leaves least, where any leaves little."""
     track = views.tracks[index]
     causes = []
@@ -184,8 +185,9 @@ def _cause(views: ComparedViews, index: int, own_px: float) -> str | None:
         left_px = views.with_track(index, back).own_px(index, views.times_s)
         causes.append((left_px / own_px, _turn_remedy(track.name, turn_deg, left_px)))
     share, remedy = min(causes, key=lambda cause: _known(cause[0]))
-    late_share, late_remedy = _shift(views, index)
-    if late_share < min(EXPLAINED_BY_TIME, _known(share)):
+    late_share, late_px, late_remedy = _shift(views, index)
+    as_others = late_px < AS_OTHERS * others_px < np.inf
+    if late_share < min(EXPLAINED_BY_TIME if as_others else EXPLAINED, _known(share)):
         return late_remedy
     return remedy if share < EXPLAINED else None
 
@@ -195,20 +197,21 @@ def _known(value: float) -> float:
     return value if np.isfinite(value) else np.inf
 
 
-def _shift(views: ComparedViews, index: int) -> tuple[float, str]:
-    """Chosen on some of the fast instants, judged on others."""
+def _shift(views: ComparedViews, index: int) -> tuple[float, float, str]:
+    """The share and the pixels it leaves; chosen on some of the fast instants, judged on others."""
     track = views.tracks[index]
     frames = np.round(SHIFT_RANGE_S * track.rate_hz)
     shifts_s = np.arange(-frames, frames + 1, max(1, frames // 20)) / track.rate_hz
     shift_s, _ = _best_shift(views, index, views.fast_s[::3], shifts_s)
     if abs(shift_s) < LEAST_SHIFT_S:
-        return np.inf, ""
+        return np.inf, np.inf, ""
     _, before_px = _best_shift(views, index, views.fast_s[1::3], np.zeros(1))
     _, left_px = _best_shift(views, index, views.fast_s[1::3], np.array([shift_s]))
-    return _known(left_px / max(before_px, 1e-9)), (
+    remedy = (
         f"add about {shift_s:+.2f} s to its offset_s: then {left_px:.0f} px are left; "
         "fusecap calibrate sync finds it exactly"
     )
+    return _known(left_px / max(before_px, 1e-9)), left_px, remedy
 
 
 def _best_shift(
