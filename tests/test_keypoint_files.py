@@ -7,6 +7,9 @@ import pytest
 from fusecap.body.landmarks import landmark_set_named
 from fusecap.errors import InputError
 from fusecap.sources.keypoint_files import read_keypoints
+from fusecap.sources.keypoint_tables import read_table
+from fusecap.sources.session_cameras import open_keypoints, with_detections
+from fusecap.sources.session_file import load_session
 from session_files import write_keypoints
 
 BODY25 = landmark_set_named("body25")
@@ -116,9 +119,55 @@ def test_missing_and_empty_folders_are_refused(tmp_path):
 
 
 def test_tables_of_other_programs_are_refused_with_what_to_do(tmp_path):
-    np.save(tmp_path / "points.npy", np.zeros((10, 33, 2)))
-    with pytest.raises(InputError, match=r"points\.npy: is a file; .* folder .* FreeMoCap's .npy"):
-        read(tmp_path / "points.npy")
+    (tmp_path / "points.csv").write_text("x,y\n1,2\n")
+    with pytest.raises(InputError, match=r"points\.csv: is a file; .* folder .* FreeMoCap's 2D"):
+        read(tmp_path / "points.csv")
+
+
+def freemocap(path, cameras=2, *, dtype=np.float64, points=553):
+    """A person whose points rise, unseen at times."""
+    table = np.arange(cameras * 20 * points * 3, dtype=dtype).reshape(cameras, 20, points, 3)
+    if np.issubdtype(dtype, np.floating):
+        table[0, 3:6] = np.nan
+        table[1, 7, 11] = np.nan
+    np.save(path, table)
+    return table
+
+
+def test_freemocaps_array_gives_each_camera_its_row(tmp_path):
+    table = freemocap(tmp_path / "a.npy")
+    text = '[session]\nname = "s"\nrate_hz = 30\n'
+    for name in ("left", "right"):
+        text += f'\n[[camera]]\nname = "{name}"\nkeypoints = "a.npy"\n'
+    (tmp_path / "session.toml").write_text(text)
+    left, right = open_keypoints(with_detections(load_session(tmp_path)))
+    assert left.landmarks.name == right.landmarks.name == "blazepose33"
+    assert [len(people) for people in left.people] == [1] * 3 + [0] * 3 + [1] * 14
+    columns = left.landmarks.of_keypoints(table[1, :, :33])[:, :, :2]
+    assert np.allclose(right.people[2][0, :, :2], columns[2])
+    shoulder = right.landmarks.index("left_shoulder")
+    assert right.people[7][0, shoulder, 2] == 0 and right.people[8][0, shoulder, 2] == 1
+    assert np.allclose(right.times_s, np.arange(20) / 30)
+
+
+@pytest.mark.parametrize(
+    ("make", "told"),
+    [
+        (lambda path: freemocap(path, 3), "holds 3 cameras, 2 of the session"),
+        (lambda path: freemocap(path, points=20), "an array of"),
+        (lambda path: freemocap(path, dtype=np.int32), "an array of int32"),
+        (lambda path: path.write_bytes(b"PK garbage"), "cannot be read as an array"),
+        (lambda path: np.save(path, np.array([{}], dtype=object)), "an array of"),
+        (
+            lambda path: (freemocap(path), path.write_bytes(path.read_bytes()[:9000])),
+            "is cut off",
+        ),
+    ],
+)
+def test_other_arrays_are_refused(tmp_path, make, told):
+    make(tmp_path / "a.npy")
+    with pytest.raises(InputError, match=told):
+        read_table(tmp_path / "a.npy", 0, 2)
 
 
 @pytest.mark.real_data

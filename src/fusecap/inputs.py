@@ -73,6 +73,7 @@ CALIBRATION = InputKind(
     what="a calibration of cameras", most_bytes=16 * _MB, error=CalibrationError
 )
 KEYPOINTS = InputKind(what="keypoints of one frame as JSON", most_bytes=4_000_000)
+KEYPOINT_TABLE = InputKind(what="keypoints as an array (.npy)", most_bytes=4096 * _MB)
 DETECTION = InputKind(what="the record of a detection", most_bytes=64 * _MB)
 SENSORS = InputKind(what="samples of sensors", most_bytes=1024 * _MB)
 POINTS = InputKind(what="a table of points as CSV", most_bytes=16 * _MB)
@@ -93,6 +94,7 @@ CELL = InputKind(what="a cell of an experiment", most_bytes=64 * _MB)
 
 KINDS = (
     *(SESSION, SETTINGS, CALIBRATION, BOARD, KEYPOINTS, DETECTION, SENSORS, POINTS),
+    KEYPOINT_TABLE,
     *(
         FRAME_TIMES,
         PICTURE,

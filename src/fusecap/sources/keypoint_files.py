@@ -27,6 +27,7 @@ from fusecap.errors import InputError
 from fusecap.inputs import KEYPOINTS, read_bytes
 from fusecap.progress import Progress
 from fusecap.sources.detection_files import read_record
+from fusecap.sources.keypoint_tables import BODY_POINTS, LANDMARK_SET, SUFFIX, read_table
 from fusecap.sources.people_store import PeopleStore
 
 MAX_FRAME = 10**9
@@ -77,14 +78,19 @@ def read_keypoints(
     rate_hz: float,
     offset_s: float = 0.0,
     own_times: bool = True,
+    place: tuple[int, int] = (0, 1),
     progress: Progress | None = None,
 ) -> KeypointTrack:
-    """All frames of one camera.
+    """All frames of one camera, whose `place` in a table of several is (row, rows).
 
     With `own_times` the times and rate that a detection left beside the frames replace `rate_hz`.
     Raises `InputError` for a folder without frames, one whose files are all broken, and keypoints
     of another format; a broken file among good ones counts as a frame without people.
     """
+    if folder.suffix == SUFFIX and folder.is_file():
+        return _of_table(
+            folder, place, name=name, landmarks=landmarks, rate_hz=rate_hz, offset_s=offset_s
+        )
     numbered = _numbered_files(folder)
     people = PeopleStore(len(landmarks.landmark_names), 3)
     looks = PeopleStore(APPEARANCE_SIZE, dtype=np.uint8)
@@ -130,6 +136,36 @@ def read_keypoints(
     )
 
 
+def _of_table(
+    path: Path,
+    place: tuple[int, int],
+    *,
+    name: str,
+    landmarks: LandmarkSet,
+    rate_hz: float,
+    offset_s: float,
+) -> KeypointTrack:
+    if landmarks.keypoint_count != BODY_POINTS:
+        raise InputError(
+            f"{path}: FreeMoCap's points are openpose-{LANDMARK_SET}, the cameras have "
+            f"openpose-{landmarks.name}"
+        )
+    found = read_table(path, *place)
+    people = PeopleStore(len(landmarks.landmark_names), 3)
+    for person in found:
+        people.append(without_missing(landmarks.of_keypoints(person[None])))
+    frames = np.arange(len(found))
+    return KeypointTrack(
+        name=name,
+        landmarks=landmarks,
+        rate_hz=rate_hz,
+        frames=frames,
+        times_s=frames / rate_hz + offset_s,
+        people=people,
+        broken=(),
+    )
+
+
 def frame_step(frames: np.ndarray) -> int:
     """How far apart frame numbers regularly are: 1, or what all of many are multiples of."""
     if len(frames) < LEAST_STEPPED:
@@ -151,7 +187,7 @@ def _numbered_files(folder: Path) -> dict[int, str]:
     if folder.is_file():
         raise InputError(
             f"{folder}: is a file; expected a folder with one keypoint JSON per frame, as OpenPose "
-            "writes them. Tables of another program, such as FreeMoCap's .npy, go in through "
+            "writes them, or FreeMoCap's 2D data (.npy). Tables of another program go in through "
             "Python (examples/1_own_detections.py)"
         )
     if not folder.is_dir():
@@ -234,6 +270,8 @@ def _bytes(looks: Any) -> list[int]:
 
 def sets_in(folder: Path) -> list[LandmarkSet]:
     """Those with as many keypoints as the first person in a folder; raises `InputError`."""
+    if folder.suffix == SUFFIX and folder.is_file():
+        return [LANDMARK_SETS[LANDMARK_SET]]
     for file in _numbered_files(folder).values():
         try:
             persons = _persons(os.path.join(folder, file))

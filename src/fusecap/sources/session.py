@@ -404,6 +404,11 @@ class Session(_Table):
         folder = distinct_names(names)[names.index(camera.name)]
         return self.folder / "keypoints" / folder
 
+    def place_in_table(self, camera: CameraSettings) -> tuple[int, int]:
+        """Which of the cameras it is that name the same keypoints, and how many do."""
+        names = [each.name for each in self.cameras if each.keypoints == camera.keypoints]
+        return names.index(camera.name), len(names)
+
     def camera_rate_hz(self, camera: CameraSettings) -> float:
         """A camera's frame rate."""
         return camera.rate_hz or self.settings.rate_hz

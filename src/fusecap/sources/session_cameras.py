@@ -44,7 +44,7 @@ def rate_is_stated(session: Session) -> bool:
 def _as_its_files_say(session: Session, camera: CameraSettings) -> CameraSettings:
     if camera.keypoints is None:
         return _with_folder(session, camera)
-    if not camera.keypoints.is_dir() or read_record(camera.keypoints) is not None:
+    if not camera.keypoints.exists() or read_record(camera.keypoints) is not None:
         return camera
     told: dict[str, object] = {}
     if "format" not in camera.model_fields_set:
@@ -180,6 +180,7 @@ def camera_track(
         rate_hz=session.camera_rate_hz(camera),
         offset_s=camera.offset_s,
         own_times=camera.rate_hz is None,
+        place=session.place_in_table(camera),
         progress=progress,
     )
 

@@ -348,7 +348,9 @@ def content_hash(session: Session) -> str:
     inputs = [session.settings.calibration, session.settings.landmark_offsets]
     inputs += [session.settings.imu_calibration]
     inputs += [session.settings.sync] if session.settings.sync is not None else []
-    inputs += [imu.file for subject in session.subjects for imu in subject.imus]
+    for subject in session.subjects:
+        inputs += [file for imu in subject.imus for file in (imu.file, imu.static_file)]
+    inputs += [c.keypoints for c in session.cameras if c.keypoints and not c.keypoints.is_dir()]
     for path in inputs:
         if path is not None and path.is_dir():
             for file in sorted(path.iterdir()):

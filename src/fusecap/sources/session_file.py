@@ -84,25 +84,27 @@ def missing_files(session: Session) -> list[str]:
     """One line per file or folder that the session names and that is not there."""
     lines = []
 
-    def check(where: str, path: Path | None, *, folder: bool | None) -> None:
+    def check(where: str, path: Path | None, *, or_folder: bool) -> None:
         if path is None:
             return
-        kind = {True: "folder", False: "file", None: "file or folder"}[folder]
+        kind = "file or folder" if or_folder else "file"
         if not path.exists():
             lines.append(f"{where}: no {kind} {path}; check the path (relative to {FILE_NAME})")
-        elif (folder is True and not path.is_dir()) or (folder is False and not path.is_file()):
+        elif not or_folder and not path.is_file():
             lines.append(f"{where}: {path} is not a {kind}")
 
-    check("[session] calibration", session.settings.calibration, folder=None)
-    check("[session] landmark_offsets", session.settings.landmark_offsets, folder=False)
-    check("[session] imu_calibration", session.settings.imu_calibration, folder=False)
-    check("[session] sync", session.settings.sync, folder=False)
+    check("[session] calibration", session.settings.calibration, or_folder=True)
+    check("[session] landmark_offsets", session.settings.landmark_offsets, or_folder=False)
+    check("[session] imu_calibration", session.settings.imu_calibration, or_folder=False)
+    check("[session] sync", session.settings.sync, or_folder=False)
     for camera in session.cameras:
-        check(f"[[camera]] '{camera.name}' keypoints", camera.keypoints, folder=True)
-        check(f"[[camera]] '{camera.name}' video", camera.video, folder=False)
+        check(f"[[camera]] '{camera.name}' keypoints", camera.keypoints, or_folder=True)
+        check(f"[[camera]] '{camera.name}' video", camera.video, or_folder=False)
     for subject in session.subjects:
         for imu in subject.imus:
-            check(f"[[subject]] '{subject.name}' imu '{imu.bone}' file", imu.file, folder=False)
+            where = f"[[subject]] '{subject.name}' imu '{imu.bone}'"
+            check(f"{where} file", imu.file, or_folder=False)
+            check(f"{where} static_file", imu.static_file, or_folder=False)
     return lines
 
 
@@ -113,7 +115,8 @@ def input_files(session: Session) -> list[Path]:
     named += [settings.imu_calibration, settings.sync]
     for camera in session.cameras:
         named += [camera.video, camera.keypoints or session.detection_folder(camera)]
-    named += [imu.file for subject in session.subjects for imu in subject.imus]
+    for subject in session.subjects:
+        named += [file for imu in subject.imus for file in (imu.file, imu.static_file)]
     folders = [path for path in named if path is not None and path == settings.calibration]
     inside = [file for folder in folders if folder.is_dir() for file in folder.iterdir()]
     return [session.path, *(path for path in named if path is not None), *inside]

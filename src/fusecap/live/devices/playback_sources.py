@@ -175,6 +175,7 @@ def _cameras(
                 rate_hz=session.camera_rate_hz(camera),
                 offset_s=camera.offset_s,
                 own_times=camera.rate_hz is None,
+                place=session.place_in_table(camera),
                 progress=progress,
             )
             yield Keypoints(index, track, clock.session_s(track.times_s))
