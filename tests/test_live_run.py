@@ -387,7 +387,7 @@ def test_what_was_measured_after_it_came_is_left_out_and_told():
     assert source.counts.dropped == 5
     assert going.report is not None
     assert [i.what for i in going.report.incidents if "future" in i.what] == [
-        "imus: samples from the future are left out; see its clock"
+        "imus: samples from the future are left out; see its clock and offset_s"
     ]
 
 

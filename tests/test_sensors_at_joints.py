@@ -59,6 +59,15 @@ def test_nothing_is_said_of_sensors_that_belong_together(sound):
     assert said(sound) == []
 
 
+def test_bones_that_only_a_larger_skeleton_has_are_left_to_others(folder):
+    path = folder / "session.toml"
+    text = path.read_text().replace("[session]\n", '[session]\nskeleton = "extended23"\n', 1)
+    text = text.replace('bone = "left_upper_arm"', 'bone = "left_clavicle"', 1)
+    path.write_text(text)
+    assert "left_clavicle" in text
+    assert not [text for text in said(folder) if "clavicle" in text]
+
+
 @pytest.mark.parametrize(
     ("who", "late_s"), [("anna_left_shank", 0.1), ("anna_hips", 1.0), ("ben_right_forearm", -0.4)]
 )

@@ -159,5 +159,6 @@ def _check_gravity(where: str, imu: ImuSettings, track: ImuTrack, findings: Find
                 "warning",
                 where,
                 f"gravity points {angle:.0f} deg away from the sensor world's {imu.imu_up} axis",
-                "check that its quaternion is w, x, y, z from sensor to world",
+                ("multiply its accelerations by -1, or " if angle > 165 else "")
+                + "check that its quaternion is w, x, y, z from sensor to world",
             )

@@ -345,7 +345,8 @@ def _body(
     worn: dict[str, MountedImu] = {}
     for imu, track in zip(subject.imus, tracks, strict=True):
         known = f"imu '{imu.bone}' of '{subject.name}'" in told
-        if known or track is None or track.up_axis not in (None, imu.imu_up):
+        foreign = imu.bone not in PAPER21.bone_names or track is None
+        if known or foreign or track.up_axis not in (None, imu.imu_up):
             continue
         try:
             (worn[imu.bone],) = mount(subject.model_copy(update={"imus": (imu,)}), [track])
@@ -363,7 +364,12 @@ def _body(
     starts_s = start_s + np.linspace(0.0, length_s - stretch_s, count)
     times_s = starts_s[:, None] + np.arange(int(stretch_s * RATE_HZ)) / RATE_HZ
     shape = BodyShape.from_height(PAPER21, subject.height_m or REFERENCE_HEIGHT_M)
-    body = _Body(subject.name, shape.with_lengths(subject.bone_lengths_m), mounted, times_s)
+    lengths_m = {
+        bone: length_m
+        for bone, length_m in subject.bone_lengths_m.items()
+        if bone in PAPER21.bone_names
+    }
+    body = _Body(subject.name, shape.with_lengths(lengths_m), mounted, times_s)
     return body if body.joints else None
 
 
@@ -387,10 +393,9 @@ def _check_causes(session: Session, bodies: Sequence[_Body], findings: Findings)
             break
         best = max(causes, key=lambda cause: cause.before - cause.left)
         where = [body.where(index) for body, moved in best.instead for index in moved]
-        if not named.isdisjoint(where):
-            break
+        told = best.told and named.isdisjoint(where)
         named.update(where)
-        if best.told:
+        if told:
             findings.add(
                 "warning",
                 where[0],

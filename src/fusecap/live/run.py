@@ -231,7 +231,10 @@ class LiveRun:
             return
         if item.timestamp_ns > now_ns + SOONEST_NS:
             feed.source.counts.dropped += 1
-            self._refuse(f"{feed.source.name}: samples from the future are left out; see its clock")
+            self._refuse(
+                f"{feed.source.name}: samples from the future are left out; see its clock and "
+                "offset_s"
+            )
             return
         source.arrived(now_ns)
         self._feed_of[key] = feed

@@ -89,6 +89,8 @@ def _wrong_up(worn: Worn) -> str:
     if found is None or found == worn.settings.imu_up:
         return ""
     hint = f'set imu_up = "{found}"' if found in UPRIGHT else "check the axes of its file"
+    if found.lstrip("-") == worn.settings.imu_up.lstrip("-"):
+        hint += ", or multiply its accelerations by -1"
     return (
         f'gravity points along {found} of its reference world, imu_up is "{worn.settings.imu_up}"; '
         f"{hint}"
