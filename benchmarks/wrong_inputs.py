@@ -17,6 +17,7 @@ import argparse
 import importlib.util
 import re
 import shutil
+import subprocess
 import sys
 import tarfile
 import tempfile
@@ -31,11 +32,22 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fusecap.batch.solve import solve_session
+from fusecap.body.landmarks import landmark_set_named
 from fusecap.body.skeleton import PAPER21
 from fusecap.doctor import diagnose
 from fusecap.errors import FusecapError
 from fusecap.evaluate.demo_scene import demo_scene
+from fusecap.evaluate.imu_noise import IMUS_13
 from fusecap.evaluate.simulated_session import write_session
+from fusecap.evaluate.simulator import Person, placed, simulate
+from fusecap.evaluate.twin import (
+    TWIN_IMU_NOISE,
+    TWIN_KEYPOINT_NOISE,
+    twin_sequence,
+    twin_simulation,
+    twin_training_sequences,
+)
+from fusecap.geometry.camera import Rig
 from fusecap.sources.calibration_files import load_rig
 from fusecap.sources.calibration_files.formats import aniposelib
 from fusecap.sources.session_data import open_session
@@ -602,6 +614,11 @@ def clean_sessions(real: Path | None, into: Path) -> Iterator[tuple[str, Path]]:
         folder = into / f"demo-{base}"
         write_base(base, folder, seconds=6.0)
         yield f"demo, {base}", folder / "session.toml"
+    for sequence in twin_training_sequences():
+        for imus in (13, 6, 0):
+            simulation = twin_simulation(sequence, cameras=4, imus=imus, seed=6)
+            folder = into / f"{sequence.key}-{imus}"
+            yield f"twin {sequence.key}, {imus} sensors", write_session(simulation, folder)
     if real is None:
         return
     gait = _script("examples/gait_imu_only.py")
@@ -620,6 +637,36 @@ def clean_sessions(real: Path | None, into: Path) -> Iterator[tuple[str, Path]]:
     for path in sorted((into / "kam").rglob("*.toml")):
         if "[session]" in path.read_text():
             yield f"kam {path.name}", path
+    walker = into / "kam" / "walker1"
+    command = [sys.executable, "-m", "fusecap", "calibrate", "imu", str(walker), "--write"]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    yield "kam session.toml, its sensors calibrated", walker / "session.toml"
+    yield "caliscope", _before_caliscope(real, into / "caliscope")
+
+
+def _before_caliscope(real: Path, folder: Path) -> Path:
+    """Somebody simulated before its lenses, three times as far away: they stood around a desk."""
+    rig = load_rig(real / "caliscope/post_optimization/camera_array.toml", up="z")
+    across = [np.eye(3) - np.outer(c.rotation[2], c.rotation[2]) for c in rig.cameras]
+    seen = [a @ c.position_in_world for a, c in zip(across, rig.cameras, strict=True)]
+    middle = np.linalg.solve(np.sum(across, axis=0), np.sum(seen, axis=0))
+    cameras = []
+    for camera in rig.cameras:
+        place = 3.0 * (camera.position_in_world - middle) + [0.0, 0.9, 0.0]
+        cameras.append(replace(camera, translation=-camera.rotation @ place))
+    sequence = twin_sequence("T2 ROM1")
+    theta = placed(sequence.theta, centre_m=(0.0, 0.0))
+    person = Person(name="T2", shape=sequence.shape, theta=theta, imu_bones=IMUS_13)
+    simulation = simulate(
+        [person],
+        Rig(cameras=tuple(cameras)),
+        landmark_set_named("body25"),
+        rate_hz=sequence.rate_hz,
+        seed=0,
+        keypoint_noise=TWIN_KEYPOINT_NOISE,
+        imu_noise=TWIN_IMU_NOISE,
+    )
+    return write_session(simulation, folder)
 
 
 def _script(path: str):
