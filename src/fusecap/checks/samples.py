@@ -8,6 +8,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from fusecap.checks.measurements import check_motion
+from fusecap.files import Spool
 from fusecap.findings import Findings
 from fusecap.setup import SessionSetup
 from fusecap.sources.imu_files.track import ImuTrack
@@ -93,21 +94,26 @@ class _Seen:
 class _Worn:
     """What one sensor measured."""
 
+    _SAMPLE = np.dtype([("ns", np.int64), ("wxyz", np.float32, 4), ("accel", np.float32, 3)])
+
     def __init__(self) -> None:
-        self._times_ns = array("q")
-        self._values = array("f")
+        self._samples = Spool()
+        self._one = np.empty(1, self._SAMPLE)
 
     def add(self, sample: ImuSample) -> None:
         if 0.1 < np.linalg.norm(sample.orientation_wxyz) < 10.0:
-            self._times_ns.append(sample.timestamp_ns)
-            self._values.extend(sample.orientation_wxyz)
-            self._values.extend(sample.accel_m_s2)
+            self._one["ns"] = sample.timestamp_ns
+            with np.errstate(over="ignore"):  # of numbers beyond every scale
+                self._one["wxyz"], self._one["accel"] = sample.orientation_wxyz, sample.accel_m_s2
+            self._samples.append(self._one.tobytes())
 
     def track(self) -> ImuTrack | None:
-        times_ns, rows = np.unique(self._times_ns, return_index=True)
+        samples = np.frombuffer(self._samples.read(0, len(self._samples)), self._SAMPLE)
+        times_ns, rows = np.unique(samples["ns"], return_index=True)
         if len(rows) < LEAST_SAMPLES:
             return None
-        values = np.frombuffer(self._values, np.float32).reshape(-1, 7)[rows]
         return ImuTrack(
-            times_s=1e-9 * times_ns, orientation_wxyz=values[:, :4], accel_m_s2=values[:, 4:]
+            times_s=1e-9 * times_ns,
+            orientation_wxyz=samples["wxyz"][rows],
+            accel_m_s2=samples["accel"][rows],
         )
