@@ -164,3 +164,10 @@ def test_an_accelerometer_of_twice_the_range_is_told(folder):
     each_table(folder, doubled)
     (only,) = said(folder)
     assert only.startswith("imu 'left_shank' of 'anna': the accelerometer reads 20.8 m/s2")
+
+
+def test_bones_that_no_body_has_are_left_to_whoever_makes_bodies(folder):
+    path = folder / "session.toml"
+    text = path.read_text().replace("height_m = 1.68", "height_m = 1.68\nbone_lengths_m.head = 3.0")
+    path.write_text(text)
+    assert said(folder) == []

@@ -345,8 +345,9 @@ def _body(
     worn: dict[str, MountedImu] = {}
     for imu, track in zip(subject.imus, tracks, strict=True):
         known = f"imu '{imu.bone}' of '{subject.name}'" in told
-        foreign = imu.bone not in PAPER21.bone_names or track is None
-        if known or foreign or track.up_axis not in (None, imu.imu_up):
+        if known or track is None or imu.bone not in PAPER21.bone_names:
+            continue
+        if track.up_axis not in (None, imu.imu_up):
             continue
         try:
             (worn[imu.bone],) = mount(subject.model_copy(update={"imus": (imu,)}), [track])
@@ -363,13 +364,17 @@ def _body(
     stretch_s = min(length_s, STRETCH_S)
     starts_s = start_s + np.linspace(0.0, length_s - stretch_s, count)
     times_s = starts_s[:, None] + np.arange(int(stretch_s * RATE_HZ)) / RATE_HZ
-    shape = BodyShape.from_height(PAPER21, subject.height_m or REFERENCE_HEIGHT_M)
     lengths_m = {
         bone: length_m
         for bone, length_m in subject.bone_lengths_m.items()
         if bone in PAPER21.bone_names
     }
-    body = _Body(subject.name, shape.with_lengths(lengths_m), mounted, times_s)
+    shape = BodyShape.from_height(PAPER21, subject.height_m or REFERENCE_HEIGHT_M)
+    try:
+        shape = shape.with_lengths(lengths_m)
+    except FusecapError:  # refused where bodies are made
+        return None
+    body = _Body(subject.name, shape, mounted, times_s)
     return body if body.joints else None
 
 
