@@ -1,6 +1,8 @@
 """Ctrl-C between any two lines of a solve: what is kept is whole, a second one ends it at once."""
 
+import os
 import signal
+import subprocess
 import sys
 import threading
 from itertools import count
@@ -74,15 +76,79 @@ def handled():
 @pytest.mark.parametrize("number", ENDS)
 def test_a_command_is_ended_as_by_ctrl_c(number, handled):
     ends_are_ctrl_c()
-    with pytest.raises(KeyboardInterrupt):
-        signal.raise_signal(number)
     with ctrl_c_held() as stop:
         signal.raise_signal(number)
         assert stop.asked
         with pytest.raises(KeyboardInterrupt):
             press()
+
+
+@pytest.mark.parametrize("number", ENDS)
+def test_a_command_that_holds_nothing_is_ended_at_once(number, handled):
+    ends_are_ctrl_c()
     with pytest.raises(KeyboardInterrupt):
         signal.raise_signal(number)
+
+
+def test_sigterm_is_ctrl_c_as_often_as_it_comes(handled):
+    ends_are_ctrl_c()
+    with ctrl_c_held() as stop:
+        signal.raise_signal(signal.SIGTERM)
+        assert stop.asked
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGTERM)
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGTERM)
+
+
+def test_a_terminal_that_is_closed_is_no_second_ctrl_c(handled):
+    """A shell may pass SIGHUP on when the kernel has told it; what was solved is written then."""
+    ends_are_ctrl_c()
+    with ctrl_c_held() as stop:
+        press()
+        signal.raise_signal(signal.SIGHUP)
+        signal.raise_signal(signal.SIGHUP)
+        assert stop.asked
+    signal.raise_signal(signal.SIGHUP)
+
+
+_IN_A_TERMINAL = """
+import os, sys, time
+os.login_tty(0)
+from contextlib import nullcontext
+from pathlib import Path
+from fusecap import cli
+from fusecap.cli.terminal import progress
+from fusecap.interrupts import Interruption, ctrl_c_held
+
+def command():
+    with progress(quiet=False) as show, held() as stop:
+        while not stop.asked:
+            show("solving", 1, 9)
+            time.sleep(0.01)
+    Path(sys.argv[1]).write_text("whole")
+    raise KeyboardInterrupt
+
+held = ctrl_c_held if sys.argv[1] else lambda: nullcontext(Interruption())
+cli.app = command
+cli.main()
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "login_tty"), reason="no terminals that can be closed")
+@pytest.mark.parametrize("held", [True, False])
+def test_a_closed_terminal_costs_neither_the_file_nor_the_exit_code(held, tmp_path):
+    master, terminal = os.openpty()
+    file = tmp_path / "take"
+    command = [sys.executable, "-c", _IN_A_TERMINAL, str(file) if held else ""]
+    with subprocess.Popen(command, stdin=terminal) as running:
+        os.close(terminal)
+        shown = b""
+        while b"solving" not in shown:
+            shown += os.read(master, 1024)
+        os.close(master)
+        assert running.wait(60) == 130
+    assert file.is_file() == held
 
 
 def test_who_ignores_an_end_goes_on_doing_so(handled):

@@ -7,7 +7,9 @@ that says when, too. Work that goes by instants or frames holds it, and asks bet
 from __future__ import annotations
 
 import atexit
+import os
 import signal
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
@@ -22,8 +24,35 @@ def ends_are_ctrl_c() -> None:
     """
     for number in _ends()[1:]:
         if signal.getsignal(number) is signal.SIG_DFL:
-            signal.signal(number, signal.default_int_handler)
+            signal.signal(number, _end)
     atexit.register(_ignore_ends)
+
+
+def _end(number: int, frame: FrameType | None) -> None:
+    leave_terminal(number)
+    raise KeyboardInterrupt
+
+
+_OURS = (signal.default_int_handler, _end)
+
+
+def leave_terminal(number: int) -> bool:
+    """Whether a signal is SIGHUP; then no other one comes, and a closed terminal is let go of.
+
+    Else whatever is said to it would fail, also between the end of work and its file. A shell may
+    pass SIGHUP on a second time.
+    """
+    if number != getattr(signal, "SIGHUP", None):
+        return False
+    signal.signal(number, signal.SIG_IGN)
+    for output in (1, 2):
+        with suppress(OSError):
+            # A terminal that was closed is none any more, but still a device.
+            if stat.S_ISCHR(os.fstat(output).st_mode) and not os.isatty(output):
+                nowhere = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(nowhere, output)
+                os.close(nowhere)
+    return True
 
 
 def _ignore_ends() -> None:
@@ -44,7 +73,7 @@ class Interruption:
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
         """As a handler of SIGINT."""
-        if self.asked:
+        if not leave_terminal(number) and self.asked:
             raise KeyboardInterrupt
         self.asked = True
 
@@ -63,7 +92,7 @@ def ctrl_c_held() -> Iterator[Interruption]:
         yield outer[0]
         return
     interruption = Interruption()
-    held = [n for n, handler in handlers.items() if handler is signal.default_int_handler]
+    held = [n for n, handler in handlers.items() if handler in _OURS]
     with suppress(ValueError):  # in another thread
         for number in held:
             signal.signal(number, interruption)
@@ -72,4 +101,5 @@ def ctrl_c_held() -> Iterator[Interruption]:
     finally:
         with suppress(ValueError):
             for number in held:
-                signal.signal(number, signal.default_int_handler)
+                if signal.getsignal(number) is interruption:
+                    signal.signal(number, handlers[number])

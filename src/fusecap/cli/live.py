@@ -17,6 +17,7 @@ from fusecap.cli.models import ask_for_networks
 from fusecap.cli.targets import TO_HELP, placed_targets, warn_if_open
 from fusecap.cli.terminal import console, err, note, progress
 from fusecap.errors import InputError
+from fusecap.interrupts import leave_terminal
 
 if TYPE_CHECKING:
     from fusecap.live.devices.playback_sources import PlaybackOptions, Stall
@@ -286,6 +287,7 @@ def _until_interrupted(run: LiveRun, *, quiet: bool) -> Iterator[None]:
     """Ctrl-C, SIGTERM and SIGHUP end the run; a second one does not cut its end short."""
 
     def end(number: int, frame: object) -> None:
+        leave_terminal(number)
         run.stop()
         if not quiet:
             err.print("ending: closing devices, streams and the recording")
@@ -297,4 +299,5 @@ def _until_interrupted(run: LiveRun, *, quiet: bool) -> Iterator[None]:
         yield
     finally:
         for number, handler in before.items():
-            signal.signal(number, handler)
+            if signal.getsignal(number) is end:
+                signal.signal(number, handler)
