@@ -95,8 +95,8 @@ def _check_amount(
     session: Session, tracks: Mapping[str, KeypointTrack], findings: Findings
 ) -> None:
     with_imus = any(subject.imus for subject in session.subjects)
-    seen = sum(len(people) for track in tracks.values() for people in track.people)
-    if tracks and seen == 0:
+    seen = any(len(people) for track in tracks.values() for people in track.people)
+    if tracks and not seen:
         findings.add(
             "warning" if with_imus else "error",
             "cameras",

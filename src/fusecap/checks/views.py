@@ -61,7 +61,7 @@ class ComparedViews:
     @classmethod
     def of(cls, rig: Rig, keypoints: Sequence[KeypointTrack]) -> ComparedViews | None:
         """None where nothing can be compared."""
-        if len(keypoints) < 2 or not all(sum(map(len, track.people)) for track in keypoints):
+        if len(keypoints) < 2 or not all(any(map(len, track.people)) for track in keypoints):
             return None
         rig, tracks = view_agreement.without_distortion(
             rig.subset([track.name for track in keypoints]), keypoints
