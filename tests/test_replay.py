@@ -196,6 +196,32 @@ def test_instants_of_a_recording_are_those_of_all_samples_in_memory(
                 )
 
 
+def test_sources_that_were_silent_for_long_are_back_with_their_first_sample(run, tmp_path):
+    """As for who asks for that instant alone."""
+    setup, taken = run
+    events = [event for event, _ in taken if not isinstance(event, Command)]
+    late = [
+        replace(
+            event, timestamp_ns=event.timestamp_ns + 12_000_000_000 * (event.timestamp_ns > 5e8)
+        )
+        for event in events
+    ]
+    recording = written(tmp_path / "run.mcap", setup, [(event, None) for event in late])
+    in_order, alone = StoredInstants(recording), StoredInstants(recording)
+    back = 0
+    for instant in range(len(in_order)):
+        seen, worn = in_order.detections(instant), in_order.readings(instant)
+        if not 12.4e9 < seen.timestamp_ns < 12.6e9:
+            continue
+        alone.detections(0), alone.readings(0)
+        expected = alone.detections(instant)
+        for found, there in zip(seen.people, expected.people, strict=True):
+            np.testing.assert_array_equal(found, there)
+        assert worn.keys() == alone.readings(instant).keys()
+        back += len(worn) > 0 and any(len(people) for people in seen.people)
+    assert back > 3
+
+
 @pytest.fixture
 def damaged(recorded, tmp_path) -> Path:
     """A byte of one chunk in the middle is another; what is told at the end is right."""

@@ -155,13 +155,15 @@ class _Source:
         return times_ns[: self._next]
 
     def until(self, now_ns: int) -> Iterator[Event]:
-        """The next ones that are not malformed, to the first after an instant."""
+        """The next ones that are not malformed, to the first after an instant; none far ahead."""
         while self._reached_ns <= now_ns and self._next < len(self._times_ns):
-            at, self._next = self._next, self._next + 1
-            time_ns, sample = int(self._times_ns[at]), self._read(at)
-            if sample is not None or time_ns > now_ns + KEPT_NS:
-                self._reached_ns = time_ns
+            at = self._next
+            time_ns = int(self._times_ns[at])
+            if time_ns > now_ns + KEPT_NS:
+                return
+            self._next, sample = at + 1, self._read(at)
             if sample is not None:
+                self._reached_ns = time_ns
                 yield sample
 
     def _read(self, at: int) -> Event | None:
