@@ -13,7 +13,7 @@ from pathlib import Path
 class Square:
     number: int
     does: str = ""
-    """"raise", "die", "end" or "wait"; else it squares at once."""
+    """"raise", "die", "end", "hang up" or "wait"; else it squares at once."""
     log: str = ""
     """Folder in which every start leaves a file."""
 
@@ -28,6 +28,8 @@ def square(cell: Square) -> dict[str, float]:
     if cell.does == "end":  # as whoever stops a process asks it to, twice
         for _ in range(2):
             os.kill(os.getpid(), signal.SIGTERM)
+    if cell.does == "hang up":  # as a terminal that is closed
+        os.kill(os.getpid(), signal.SIGHUP)
     if cell.does == "wait":
         time.sleep(0.4)
     return {"square": cell.number**2, "threads": float(os.environ["OMP_NUM_THREADS"])}

@@ -161,6 +161,12 @@ def test_a_cell_that_kills_its_process_fails_alone(tmp_path, how):
     assert [o.error for o in outcomes] == ["", "its process was killed", "", "", ""]
 
 
+@pytest.mark.skipif(os.name == "nt", reason="signals")
+def test_a_closed_terminal_is_for_the_parent_alone(tmp_path):
+    (outcome,) = run_cells([Square(number=2, does="hang up")], square, folder=tmp_path, workers=1)
+    assert outcome.error == "" and outcome.result == {"square": 4, "threads": 1.0}
+
+
 def test_a_cell_file_cut_short_is_computed_again(tmp_path):
     run_cells([Square(number=5)], square, folder=tmp_path, workers=1)
     (path,) = tmp_path.glob("*.json")

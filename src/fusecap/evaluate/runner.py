@@ -222,9 +222,12 @@ def _pool(count: int) -> Iterator[ProcessPoolExecutor]:
 def _quit_with_parent() -> None:
     """A worker waits for work for ever, also when the process that had any was killed.
 
-    One that is told to end leaves no unfinished file.
+    One that is told to end leaves no unfinished file. Ctrl-C and a closed terminal are for the
+    parent, which then tells it to.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for name in ("SIGINT", "SIGHUP"):  # Windows knows no SIGHUP
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _end)
     parent = multiprocessing.parent_process()
 
