@@ -8,6 +8,7 @@ from dataclasses import replace
 from itertools import count
 from operator import attrgetter
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ from fusecap.batch.second_solve import solve_recording
 from fusecap.batch.solve import solve_session
 from fusecap.batch.stored_instants import StoredInstants
 from fusecap.body.landmarks import LANDMARK_SETS
-from fusecap.cli import app
+from fusecap.cli import app, view
 from fusecap.doctor import diagnose_recording
 from fusecap.engine.cameras import Cameras
 from fusecap.engine.engine import Engine
@@ -34,7 +35,7 @@ from fusecap.errors import InputError
 from fusecap.geometry.camera import Rig
 from fusecap.recording import layout
 from fusecap.recording.index import RecordingIndex
-from fusecap.recording.reader import RecordedEvent, Recording
+from fusecap.recording.reader import Loss, RecordedEvent, Recording
 from fusecap.setup import SessionSetup
 from fusecap.sources.session import Session
 from fusecap.sources.session_data import open_session
@@ -42,6 +43,9 @@ from fusecap.sources.session_file import load_session
 from fusecap.stored_take import load_take
 from fusecap.take import Take, save_take
 from fusecap.types import GRAVITY_M_S2, CameraSample, Command, CommandKind, ImuSample, Tick
+from fusecap.viewer import page as viewer_page
+from fusecap.viewer import recording as viewer_recording
+from fusecap.viewer import take as viewer_take
 from fusecap.viewer.recording import RecordedDetections, look_for_damage
 from live_events import same_bits
 from recorded_run import record, simulated_run
@@ -245,6 +249,52 @@ def test_damage_within_a_closed_recording_is_told_by_whoever_reads_it(damaged, c
         result = CliRunner().invoke(app, [command, str(damaged), *options])
         assert result.exit_code == 0, result.output
         assert "is damaged" in result.output.replace("\n", " "), command
+
+
+@pytest.mark.parametrize(
+    ("loss", "words"),
+    [
+        ({"malformed": 2}, "damaged in 2 entries that do not follow the format; "),
+        ({"broken_chunks": 1, "malformed": 2}, "people are missing and in 2 entries"),
+    ],
+)
+def test_only_damage_that_is_there_is_told(recorded, monkeypatch, loss, words):
+    def messages(recording):
+        recording.loss = Loss(**loss)
+        return iter(())
+
+    monkeypatch.setattr(Recording, "messages", messages)
+    told = []
+    look_for_damage(recorded, told.append).join(60)
+    assert len(told) == 1 and words in told[0]
+    assert ("people are missing" in told[0]) == ("broken_chunks" in loss)
+
+
+def test_a_recording_that_a_disk_no_longer_gives_is_told(recorded, monkeypatch):
+    def messages(recording):
+        raise OSError(5, "Input/output error")
+
+    monkeypatch.setattr(Recording, "messages", messages)
+    told = []
+    look_for_damage(recorded, told.append).join(60)
+    assert len(told) == 1 and told[0].startswith("run.mcap cannot be read to its end")
+
+
+def test_a_page_that_was_closed_is_told_nothing(recorded, monkeypatch, capsys):
+    class Shown:
+        def __init__(self, *_, **__):
+            self.tell = lambda text: None
+            self.run = lambda: reader[0]("found early")
+
+    reader = []
+    monkeypatch.setattr(viewer_page, "Page", lambda *_, **__: SimpleNamespace(stop=lambda: None))
+    monkeypatch.setattr(viewer_take, "TakePage", Shown)
+    monkeypatch.setattr(viewer_recording, "look_for_damage", lambda _, tell: reader.append(tell))
+    monkeypatch.setattr(view, "_announce", lambda *_, **__: None)
+    view.look(taken_from(recorded), "x", rig=None, curves=(), unread=recorded)
+    reader[0]("found late")
+    said = capsys.readouterr().err
+    assert "found early" in said and "found late" not in said
 
 
 def test_a_whole_recording_is_told_to_be_nothing_else(recorded):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -169,7 +170,7 @@ def look(
     from fusecap.viewer.recording import look_for_damage
     from fusecap.viewer.take import TakePage
 
-    page = Page(title, host=host, port=port)
+    page, closed = Page(title, host=host, port=port), threading.Event()
     with suppress(KeyboardInterrupt):
         try:
             shown = TakePage(
@@ -178,13 +179,15 @@ def look(
             _announce(page, browser=browser, as_json=as_json)
 
             def tell(text: str) -> None:
-                note(text)
-                shown.tell(text)
+                if not closed.is_set():
+                    note(text)
+                    shown.tell(text)
 
             if unread is not None:
                 look_for_damage(unread, tell)
             shown.run()
         finally:
+            closed.set()
             page.stop()
 
 

@@ -38,11 +38,19 @@ def look_for_damage(path: Path, tell: Callable[[str], None]) -> threading.Thread
         except InputError as error:
             tell(str(error))
             return
-        if recording.loss.damaged:
-            tell(
-                f"{path.name} is damaged in {recording.loss.broken_chunks} places of about half a "
-                "second each, where people are missing; what else is: fusecap doctor"
+        except OSError as error:
+            tell(f"{path.name} cannot be read to its end: {error}")
+            return
+        found = []
+        if recording.loss.broken_chunks:
+            found.append(
+                f"in {recording.loss.broken_chunks} places of about half a second each, where "
+                "people are missing"
             )
+        if recording.loss.malformed:
+            found.append(f"in {recording.loss.malformed} entries that do not follow the format")
+        if found:
+            tell(f"{path.name} is damaged {' and '.join(found)}; what else is: fusecap doctor")
 
     thread = threading.Thread(target=look, name="damage", daemon=True)
     thread.start()
