@@ -1,3 +1,4 @@
+import re
 import shutil
 import tarfile
 from dataclasses import replace
@@ -42,6 +43,23 @@ def test_calibration_and_keypoint_errors_are_found_together(tmp_path):
         file.write_text("{")
     text = "\n".join(said(path, "error"))
     assert "focal" in text and "none of the 5 keypoint files" in text
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"), [("a.npy", "holds 3 cameras, 4 of"), ("a.csv", "is a file")]
+)
+def test_a_keypoint_file_that_cannot_be_read_is_an_error(tmp_path, name, expected):
+    path = write_session(tmp_path, frames=5)
+    table = tmp_path / name
+    if name == "a.npy":
+        np.save(table, np.zeros((3, 5, 33, 2)))
+    else:
+        table.write_text("x,y\n")
+    text = re.sub(
+        r"(?m)^(keypoints = ).*|^format = .*\n", f'keypoints = "{name}"', path.read_text()
+    )
+    path.write_text(text)
+    assert any(expected in each for each in said(path, "error"))
 
 
 def test_share_of_truncated_files_is_stated(tmp_path):

@@ -66,7 +66,7 @@ def _told(session: Session) -> set[str]:
     told = {
         f"camera '{camera.name}'"
         for camera in session.cameras
-        if camera.keypoints is None or not camera.keypoints.is_dir()
+        if camera.keypoints is None or not camera.keypoints.exists()
     }
     told |= {
         f"imu '{imu.bone}' of '{subject.name}'"
