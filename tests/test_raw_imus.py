@@ -7,9 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from fusecap.doctor import diagnose
-from fusecap.errors import InputError
+from fusecap.errors import InputError, SessionError
 from fusecap.geometry.quaternions import from_wxyz
 from fusecap.sources.imu_files.loader import imu_format_of, read_imu
+from fusecap.sources.session_file import load_session
+from fusecap.sources.session_sensors import mount, open_imus
 from fusecap.types import GRAVITY_M_S2
 
 RATE_HZ = 100.0
@@ -58,6 +60,20 @@ def test_up_is_found_and_with_a_magnetometer_north(tmp_path, magnetic):
     assert away_deg(track, heading=magnetic)[300:].max() < 3.0
     assert ("heading is arbitrary" in " ".join(track.notes)) is not magnetic
     assert np.isfinite(track.accel_m_s2).all()
+
+
+def test_a_static_trial_of_unknown_heading_says_nothing_of_the_motion(tmp_path):
+    for name in ("a.csv", "b.csv"):
+        written(tmp_path / name, "time_s")
+    text = '[session]\nname = "s"\n\n[[subject]]\nname = "anna"\ntpose_s = [0, 2]\n'
+    text += '\n[[subject.imu]]\nbone = "hips"\nfile = "a.csv"\nheading_deg = 40\n'
+    (tmp_path / "session.toml").write_text(text)
+    (anna,) = load_session(tmp_path).subjects
+    assert len(mount(anna, open_imus(anna))) == 1
+    (tmp_path / "session.toml").write_text(text + 'static_file = "b.csv"\n')
+    (anna,) = load_session(tmp_path).subjects
+    with pytest.raises(SessionError, match="static_file and file face different ways"):
+        mount(anna, open_imus(anna))
 
 
 def test_each_format_has_its_units_and_is_known_by_its_columns(tmp_path):

@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from fusecap.errors import FusecapError, InputError
+from fusecap.geometry.camera import Rig
 from fusecap.sources.calibration_files.loader import load_rig, may_be_calibration
 from fusecap.sources.calibration_files.plausibility import SAME_PLACE_M, camera_spread
 from fusecap.sources.imu_files import imu_format_of, read_imu, sensor_names
@@ -58,8 +60,8 @@ class FolderSurvey:
     """That of all cameras, as the number of values tells."""
     calibration: Path | None
     """The one that places the cameras best."""
-    calibration_unit: str
-    """In which its cameras stand in a room."""
+    calibration_units: dict[str, float]
+    """In which its cameras stand in a room, with how far apart [m]; cm and mm may both fit."""
     other_calibrations: tuple[Path, ...]
     cameras: tuple[str, ...]
     """Of the calibration."""
@@ -81,7 +83,7 @@ def survey(folder: Path) -> FolderSurvey:
         if file.suffix == ".json" and re.search(r"\d(_keypoints)?$", file.stem):
             name = _DECORATION.sub("", file.parent.name) or file.parent.name
             keypoints.setdefault(name, file.parent.relative_to(folder))
-    calibration, unit, others, cameras = _calibration(folder, files)
+    calibration, units, others, cameras = _calibration(folder, files)
     videos, made = _videos(folder, files)
     return FolderSurvey(
         folder=folder,
@@ -90,7 +92,7 @@ def survey(folder: Path) -> FolderSurvey:
         keypoints=keypoints,
         keypoint_format=_keypoint_format(folder, keypoints),
         calibration=calibration,
-        calibration_unit=unit,
+        calibration_units=units,
         other_calibrations=others,
         cameras=cameras,
         sensors=_sensors(folder, files),
@@ -128,31 +130,40 @@ def _files(folder: Path, depth: int) -> Iterator[Path]:
 
 def _calibration(
     folder: Path, files: list[Path]
-) -> tuple[Path | None, str, tuple[Path, ...], tuple[str, ...]]:
-    """What places the cameras best, its unit, the others that could be read, and its cameras.
+) -> tuple[Path | None, dict[str, float], tuple[Path, ...], tuple[str, ...]]:
+    """What places the cameras best, its units, the others that could be read, and its cameras.
 
     Lenses alone leave all cameras at one point; of files that place them, the one written last
     has had its floor found last.
     """
-    readable: list[tuple[tuple[bool, bool, int, float], Path, str, tuple[str, ...]]] = []
+    readable: list[tuple[tuple[bool, bool, int, float], Path, dict[str, Rig]]] = []
     for file in (file for file in files if may_be_calibration(file)):
-        for unit in ("m", "cm", "mm"):
-            try:
-                rig = load_rig(file, unit=unit)
-            except FusecapError:
-                continue
-            if unit == "cm" and camera_spread(rig) > WIDEST_IN_CM_M:
-                continue
-            placed = len(rig) < 2 or camera_spread(rig) > SAME_PLACE_M
+        rigs = _in_units(file)
+        if rigs:
+            placed = any(len(rig) < 2 or camera_spread(rig) > SAME_PLACE_M for rig in rigs.values())
             world = "world" in file.stem.lower()
             rank = (placed, world, -len(file.parts), file.stat().st_mtime)
-            readable.append((rank, file.relative_to(folder), unit, rig.names))
-            break
+            readable.append((rank, file.relative_to(folder), rigs))
     if not readable:
-        return None, "m", (), ()
+        return None, {}, (), ()
     readable.sort(key=lambda item: item[0], reverse=True)
-    _, best, unit, names = readable[0]
-    return best, unit, tuple(path for _, path, *_ in readable[1:]), names
+    _, best, rigs = readable[0]
+    units = {unit: camera_spread(rig) for unit, rig in rigs.items()}
+    others = tuple(path for _, path, _ in readable[1:])
+    return best, units, others, next(iter(rigs.values())).names
+
+
+def _in_units(file: Path) -> dict[str, Rig]:
+    """A calibration in metres, else in each unit in which its cameras stand in a room."""
+    rigs: dict[str, Rig] = {}
+    for unit in ("m", "cm", "mm"):
+        with suppress(FusecapError):
+            rig = load_rig(file, unit=unit)
+            if unit == "m":
+                return {unit: rig}
+            if unit == "mm" or camera_spread(rig) <= WIDEST_IN_CM_M:
+                rigs[unit] = rig
+    return rigs
 
 
 def _keypoint_format(folder: Path, keypoints: dict[str, Path]) -> str | None:

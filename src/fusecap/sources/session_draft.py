@@ -28,11 +28,7 @@ def draft(found: FolderSurvey, networks: Mapping[str, str] = MappingProxyType({}
     lines = ["[session]", f"name = {quoted(found.folder.resolve().name)}"]
     if found.calibration is not None:
         lines.append(f"calibration = {quoted(found.calibration.as_posix())}{_why(found)}")
-        if found.calibration_unit != "m":
-            lines.append(
-                f"calibration_unit = {quoted(found.calibration_unit)}   # in metres its cameras "
-                "would not stand in a room"
-            )
+        lines += _unit(found)
         if found.calibration.name.endswith((".qca.txt", ".qca")):
             lines.append('up = "z"   # as Qualisys has it')
     elif found.videos or found.keypoints:
@@ -45,6 +41,20 @@ def draft(found: FolderSurvey, networks: Mapping[str, str] = MappingProxyType({}
         lines += ["", "[detector]   # what is on this machine: fusecap models list"]
         lines += [f"{key} = {quoted(name)}" for key, name in networks.items()]
     return "\n".join([*lines, *_cameras(found), *_subject(found)]) + "\n"
+
+
+def _unit(found: FolderSurvey) -> Iterator[str]:
+    units = found.calibration_units
+    if len(units) > 1:
+        apart = ", ".join(f"{apart_m:.2f} m in {unit}" for unit, apart_m in units.items())
+        yield f"# which? its cameras stand apart by {apart}:"
+    mark = "# " if len(units) > 1 else ""
+    for unit in units:
+        if unit != "m":
+            yield (
+                f"{mark}calibration_unit = {quoted(unit)}   # in metres its cameras would not "
+                "stand in a room"
+            )
 
 
 def _why(found: FolderSurvey) -> str:

@@ -176,8 +176,8 @@ def mount(subject: SubjectSettings, tracks: list[ImuTrack]) -> list[MountedImu]:
 def still_samples(subject: SubjectSettings, imu: ImuSettings, track: ImuTrack) -> ImuTrack:
     """The sensor while the subject stands in the T- or N-pose, of the static trial if it has one.
 
-    Raises `SessionError` without an interval or samples in it, `InputError` for a static trial that
-    cannot be read.
+    Raises `SessionError` without an interval or samples in it and for a static trial whose world
+    is not the motion's, `InputError` for one that cannot be read.
     """
     where = f"imu '{imu.bone}' of '{subject.name}'"
     if subject.still_s is None:
@@ -187,7 +187,16 @@ def still_samples(subject: SubjectSettings, imu: ImuSettings, track: ImuTrack) -
             "in the N-pose, bone_from_imu_wxyz = [1, 0, 0, 0] a sensor whose axes are the bone's"
         )
     if imu.static_file is not None:
-        track = read_imu(imu.static_file, format=imu.format, sensor=imu.sensor, rate_hz=imu.rate_hz)
+        static = read_imu(
+            imu.static_file, format=imu.format, sensor=imu.sensor, rate_hz=imu.rate_hz
+        )
+        if not (static.heading_known and track.heading_known):
+            raise SessionError(
+                f"{where}: found without a magnetometer, static_file and file face different ways, "
+                "nobody knows which; fusecap calibrate imu finds how it sits from motion the "
+                "cameras saw, or take static_file out and state when the pose is held in file"
+            )
+        track = static
     start_s, end_s = subject.still_s
     inside = (track.times_s >= start_s) & (track.times_s <= end_s)
     if not inside.any():
