@@ -1,6 +1,7 @@
 """Cameras placed by points of the scene, as Pose2Sim's users do it, and what goes wrong there."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from fusecap.errors import CalibrationError
 from fusecap.geometry.camera import Rig
 from fusecap.sources.calibration_files import load_rig, write_rig
 from fusecap.sources.marked_points import MarkedPoints
-from session_files import ring
+from session_files import calibration_toml, ring
 
 TRUE = ring(3)
 ROOM = np.array(
@@ -59,6 +60,15 @@ def test_a_place_that_was_noted_wrongly_is_named_and_left_out():
     for found, true in zip(placed, TRUE.cameras, strict=True):
         assert "'d' is" in found.problems[0]
         assert np.allclose(found.camera.position_in_world, true.position_in_world, atol=0.05)
+
+
+@pytest.mark.parametrize("aside", [[0.5, 0, 0.8], [0.5, 1.1, 0.8]])
+def test_the_one_point_beside_a_line_of_five_is_no_outlier(aside):
+    places = np.array([*np.linspace([-1, 0, 0], [1, 0, 0.3], 5), aside])
+    placed, _ = place_cameras(TRUE.cameras, marked(places, places))
+    for found, true in zip(placed, TRUE.cameras, strict=True):
+        assert found.used.all()
+        assert np.allclose(found.camera.position_in_world, true.position_in_world, atol=1e-3)
 
 
 def test_places_of_a_left_handed_system_are_told():
@@ -143,7 +153,42 @@ def test_command_tells_that_the_world_is_upside_down(tmp_path, capsys, monkeypat
     assert "below the floor" in errors and "upside down" in errors
 
 
-@pytest.mark.parametrize("arguments", [["--points", "m.csv"], ["--points", "m.csv", "a=b"]])
-def test_misuse_is_told(tmp_path, capsys, monkeypatch, arguments):
+def test_a_camera_on_the_floor_is_not_upside_down(tmp_path, capsys, monkeypatch):
+    """It came out 1 cm below, as it may: stated are decimetres."""
+    lowered = [
+        replace(c, translation=-c.rotation @ (c.position_in_world * [1, 0, 1] - [0, 0.01, 0]))
+        for c in TRUE.cameras
+    ]
+    marks, out = csv(tmp_path / "marks.csv", ROOM, ROOM, lowered), tmp_path / "calibration.toml"
+    code, _, errors = run(
+        capsys, monkeypatch, "--points", marks, "--intrinsics", lenses(tmp_path), "--out", out
+    )
+    assert code == 0 and "below the floor" not in errors
+
+
+def test_lenses_of_cameras_that_stood_in_millimetres_are_read(tmp_path, capsys, monkeypatch):
+    far = tmp_path / "old.toml"
+    far.write_text(calibration_toml(TRUE, unit_per_metre=1000))
+    marks, out = csv(tmp_path / "marks.csv", ROOM, ROOM), tmp_path / "calibration.toml"
+    command = ["--points", marks, "--intrinsics", far, "--out", out]
+    assert run(capsys, monkeypatch, *command)[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "option"),
+    [
+        (["--points", "m.csv"], "--points"),
+        (["--points", "m.csv", "a=b"], "--points"),
+        (["--points", "m.csv", "--refine-intrinsics"], "--refine-intrinsics"),
+        (["--points", "m.csv", "--origin-frame", "0"], "--origin-frame"),
+        (["--points", "m.csv", "--timestamps", "t.csv"], "--timestamps"),
+        (["--points", "m.csv", "--every", "2"], "--every"),
+        (["--from-people", "s", "--every", "2"], "--every"),
+        (["--from-people", "s", "--intrinsics", "i.toml"], "--intrinsics"),
+        (["--from-people", "s", "--up", "z"], "--up"),
+        (["a=a.mp4", "b=b.mp4", "--board", "b.toml", "--up", "z"], "--up"),
+    ],
+)
+def test_misuse_is_told(capsys, monkeypatch, arguments, option):
     code, _, errors = run(capsys, monkeypatch, *arguments)
-    assert code == 2 and "--points" in errors
+    assert code == 2 and f"for {option}" in errors

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -107,12 +108,21 @@ def extrinsics(
     scene instead. With --from-people SESSION, a rough calibration is refined, from the keypoints of
     people who walk about.
     """
+    if up != "y" and points is None:
+        raise typer.BadParameter("goes with --points", param_hint="--up")
+    of_boards = {
+        "--timestamps": timestamps is not None,
+        "--refine-intrinsics": refine_intrinsics,
+        "--origin-frame": origin_frame is not None,
+        "--every": every is not None,
+    }
     if from_people is not None:
         if sources or board is not None or points is not None:
             raise typer.BadParameter(
                 "refines a session; it takes neither sources, --board nor --points",
                 param_hint="--from-people",
             )
+        _check_way("--from-people", of_boards | {"--intrinsics": intrinsics is not None})
         calibrate_from_people.from_people(
             from_people, out=out, write=write, refine=refine or (), as_json=as_json
         )
@@ -130,6 +140,7 @@ def extrinsics(
             raise typer.BadParameter(
                 "takes marks; leave out sources and --board", param_hint="--points"
             )
+        _check_way("--points", of_boards)
         calibrate_from_points.from_points(
             points, intrinsics=intrinsics, up=up, out=out, as_json=as_json
         )
@@ -198,11 +209,18 @@ def extrinsics(
         )
 
 
+def _check_way(way: str, given: Mapping[str, bool]) -> None:
+    """Raises `BadParameter` for an option of boards that is given besides."""
+    for option, is_given in given.items():
+        if is_given:
+            raise typer.BadParameter(f"goes with --board; leave it or {way} out", param_hint=option)
+
+
 def _lenses(path: Path, names: list[str]) -> list[Camera]:
     from fusecap.errors import CalibrationError
-    from fusecap.sources.calibration_files import load_rig
+    from fusecap.sources.calibration_files import load_lenses
 
-    rig = load_rig(path)
+    rig = load_lenses(path)
     strange = [name for name in names if name not in rig.names]
     if strange:
         raise CalibrationError(

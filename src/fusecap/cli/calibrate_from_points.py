@@ -22,8 +22,9 @@ def from_points(
     """Cameras by marked points, written as a calibration whose world is y up."""
     from fusecap.calibrate.cameras.scene_points import place_cameras
     from fusecap.geometry.camera import Rig
-    from fusecap.sources.calibration_files import check_rig, load_rig, write_rig
+    from fusecap.sources.calibration_files import check_rig, load_lenses, write_rig
     from fusecap.sources.calibration_files.loader import Y_UP_FROM
+    from fusecap.sources.calibration_files.plausibility import BELOW_FLOOR_M
     from fusecap.sources.calibration_files.writer import check_rig_path
     from fusecap.sources.marked_points import read_marked_points
 
@@ -35,13 +36,14 @@ def from_points(
         )
     out = out or Path("calibration.toml")
     check_rig_path(out)
-    lenses = load_rig(intrinsics).cameras
+    lenses = load_lenses(intrinsics).cameras
     marked = read_marked_points(points, tuple(lens.name for lens in lenses))
     placed, unseen = place_cameras(lenses, marked)
     rig = Rig(cameras=tuple(each.camera for each in placed)).in_world(Y_UP_FROM[up])
     problems = [problem for each in placed for problem in each.problems]
-    below = [camera.name for camera in rig.cameras if camera.position_in_world[1] < 0]
-    if below:
+    below = [c.name for c in rig.cameras if c.position_in_world[1] < BELOW_FLOOR_M]
+    inverted = 2 * len(below) > len(rig)
+    if inverted:
         problems.append(
             f"{', '.join(below)}: below the floor. The places say that up is down, a motion would "
             "come out upside down: change the sign of one horizontal coordinate of all points, or "
@@ -50,7 +52,7 @@ def from_points(
     problems += [
         f"{finding.where}: {finding.found}; {finding.remedy}"
         for finding in check_rig(rig)
-        if not below
+        if not inverted
     ]
     if unseen:
         problems.append(f"{', '.join(unseen)}: no point is marked in it, left out")

@@ -100,8 +100,8 @@ def _place(
             f"camera '{lens.name}': {len(names)} points are marked, expected {LEAST_POINTS} or "
             "more, better six that do not all lie in one plane"
         )
-    spread = np.linalg.svd(places_m - places_m.mean(axis=0), compute_uv=False)
-    if spread[1] < FLAT * max(spread[0], 1e-9):
+    spread = _spread(places_m)
+    if _on_a_line(spread):
         raise CalibrationError(
             f"camera '{lens.name}': its points lie on a line; mark another one aside"
         )
@@ -121,6 +121,15 @@ def _place(
             _problems(camera, names, places_m, pixels, miss, used, rms_px, sd_mm, spread)
         ),
     )
+
+
+def _spread(places_m: np.ndarray) -> np.ndarray:
+    """Along their longest axis, across it, and across both."""
+    return np.linalg.svd(places_m - places_m.mean(axis=0), compute_uv=False)
+
+
+def _on_a_line(spread: np.ndarray) -> bool:
+    return bool(spread[1] < FLAT * max(spread[0], 1e-9))
 
 
 def _pose(lens: Camera, places_m: np.ndarray, pixels: np.ndarray) -> Camera:
@@ -194,12 +203,17 @@ def _rms(values: np.ndarray) -> float:
 
 
 def _without_outlier(lens: Camera, places_m: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """All marks but the one, if any, that five or more others contradict."""
+    """All marks but the one, if any, that five or more others contradict.
+
+    Others on a line contradict nothing: a camera may turn about it.
+    """
     every = np.ones(len(pixels), dtype=bool)
     best, best_ratio = every, 1.0
     for index in range(len(pixels) if len(pixels) > LEAST_POINTS + 1 else 0):
         kept = every.copy()
         kept[index] = False
+        if _on_a_line(_spread(places_m[kept])):
+            continue
         try:
             away = _misses(_pose(lens, places_m[kept], pixels[kept]), places_m, pixels)
         except CalibrationError:

@@ -38,13 +38,7 @@ def load_rig(
     Raises `CalibrationError`, also for a calibration that is evidently not in the stated unit.
     """
     path = Path(path)
-    stated, unit_is_open = _read(path)
-    if not stated:
-        raise CalibrationError(f"{path}: holds no camera; {_known()}")
-    if len(stated) > MOST_CAMERAS:
-        raise CalibrationError(
-            f"{path}: {len(stated)} cameras; at most {MOST_CAMERAS} are read: keep those in use"
-        )
+    stated, unit_is_open = _some(path)
     cameras = [camera() for name, camera in stated if names is None or name in names]
     if names is not None and {camera.name for camera in cameras} != set(names):
         missing = [name for name in names if name not in {camera.name for camera in cameras}]
@@ -75,6 +69,16 @@ def load_rig(
     return rig
 
 
+def load_lenses(path: Path | str) -> Rig:
+    """`load_rig` where no one asks where the cameras stand, whatever the unit of that is."""
+    path = Path(path)
+    cameras = tuple(camera() for _, camera in _some(path)[0])
+    try:
+        return Rig(cameras=cameras)
+    except CalibrationError as error:
+        raise CalibrationError(f"{path}: {error}") from None
+
+
 def may_be_calibration(path: Path) -> bool:
     """Whether the name of a file among others is that of a calibration."""
     if path.suffix == ".json":
@@ -103,6 +107,18 @@ def _unknown(path: Path) -> CalibrationError:
             "undistort the images first"
         )
     return CalibrationError(f"{path}: not a calibration that is known; {_known()}")
+
+
+def _some(path: Path) -> tuple[list[StatedCamera], bool]:
+    """`_read`, where it is a number of cameras that can be dealt with."""
+    stated, unit_is_open = _read(path)
+    if not stated:
+        raise CalibrationError(f"{path}: holds no camera; {_known()}")
+    if len(stated) > MOST_CAMERAS:
+        raise CalibrationError(
+            f"{path}: {len(stated)} cameras; at most {MOST_CAMERAS} are read: keep those in use"
+        )
+    return stated, unit_is_open
 
 
 def _read(path: Path) -> tuple[list[StatedCamera], bool]:
