@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -170,7 +169,7 @@ def look(
     from fusecap.viewer.recording import look_for_damage
     from fusecap.viewer.take import TakePage
 
-    page, closed = Page(title, host=host, port=port), threading.Event()
+    page, is_shown = Page(title, host=host, port=port), True
     with suppress(KeyboardInterrupt):
         try:
             shown = TakePage(
@@ -179,7 +178,7 @@ def look(
             _announce(page, browser=browser, as_json=as_json)
 
             def tell(text: str) -> None:
-                if not closed.is_set():
+                if is_shown:
                     note(text)
                     shown.tell(text)
 
@@ -187,7 +186,7 @@ def look(
                 look_for_damage(unread, tell)
             shown.run()
         finally:
-            closed.set()
+            is_shown = False
             page.stop()
 
 
